@@ -1,4 +1,4 @@
-//! Predicts the speed-up of a training step on many cores from the times of its tasks on one core.
+//! Predicts the speed-up of a training step on many cores from the times that its tasks take on one core.
 //!
 //! A step consists of parallel regions, one after the other, and of serial work between them. In a
 //! region, a core takes the next task as soon as it is free. Contention for memory and the cost of
@@ -20,19 +20,20 @@ use densify_policies::policy::{CandidateRequest, DepthMode, ErrorMode, Needs, Si
 
 use steps::{median, ms};
 
-/// Numbers of cores to predict for.
+/// Numbers of cores for which the speed-up is predicted.
 const CORES: [usize; 2] = [16, 64];
 
-/// Median times of a step.
-struct Step {
+/// Median times of a training step.
+struct StepTimes {
     /// Time outside of all regions.
     serial: Duration,
+    /// Name of each parallel region, and the times of its tasks in their order.
     regions: Vec<(&'static str, Vec<Duration>)>,
 }
 
-impl Step {
-    /// Medians over the steps with the same numbers of tasks as the last step; these numbers vary with the
-    /// pixels selected as candidates.
+impl StepTimes {
+    /// Medians over the steps whose regions have as many tasks as those of the last step. The numbers of tasks vary,
+    /// because they depend on the pixels selected as candidates.
     fn median(mut steps: Vec<StepTasks>) -> Self {
         let task_counts = |step: &StepTasks| -> Vec<usize> {
             step.regions.iter().map(|(_, tasks)| tasks.len()).collect()
@@ -79,8 +80,8 @@ fn percent(part: Duration, whole: Duration) -> f64 {
     100.0 * part.as_secs_f64() / whole.as_secs_f64().max(1e-12)
 }
 
-/// Measures steps on one thread.
-fn record(rows: usize, size: u32, needs: Needs) -> Option<Step> {
+/// Measures training steps on one thread. If one fails, prints the error and returns `None`.
+fn record(rows: usize, size: u32, needs: Needs) -> Option<StepTimes> {
     let options = Setup {
         threads: Some(1),
         largest_image: (size, size),
@@ -98,8 +99,8 @@ fn record(rows: usize, size: u32, needs: Needs) -> Option<Step> {
     backend.record_tasks();
     let (camera, target) = (steps::camera(size), steps::target(size));
     let mut steps = Vec::new();
-    // With this many steps, an interruption by the system does not affect a task's median.
-    for step in 1..=steps::count(rows).max(17) {
+    // With at least 17 steps, an interruption by the system does not affect a task's median.
+    for step in 1..=steps::step_count(rows).max(17) {
         if let Err(error) = backend.train_step(&steps::input(step, &camera, &target)) {
             println!("{error}");
             return None;
@@ -108,11 +109,11 @@ fn record(rows: usize, size: u32, needs: Needs) -> Option<Step> {
             steps.push(backend.recorded_tasks());
         }
     }
-    Some(Step::median(steps))
+    Some(StepTimes::median(steps))
 }
 
-/// Prints one line per region name.
-fn print_regions(step: &Step) {
+/// Prints a table with one line per region name.
+fn print_regions(step: &StepTimes) {
     let total = step.total();
     let mut names: Vec<&str> = Vec::new();
     for (name, _) in &step.regions {
@@ -145,7 +146,7 @@ fn print_regions(step: &Step) {
     }
 }
 
-fn print_summary(step: &Step, title: &str) {
+fn print_summary(step: &StepTimes, title: &str) {
     let total = step.total();
     let tasks = step.regions.iter().flat_map(|(name, tasks)| tasks.iter().map(move |t| (t, name)));
     let (largest, name) = tasks.max().map_or((Duration::ZERO, "none"), |(t, name)| (*t, name));
@@ -164,7 +165,7 @@ fn print_summary(step: &Step, title: &str) {
     );
 }
 
-/// The needs of a policy that uses errors per pixel and candidates at every step.
+/// The needs of a policy that uses per-pixel errors and candidates at every step.
 fn largest_needs(rows: usize) -> Needs {
     let candidates = CandidateRequest {
         from: 0,
@@ -195,7 +196,7 @@ fn main() {
             print_regions(&step);
         }
         if let Some(step) = record(rows, size, largest_needs(rows)) {
-            print_summary(&step, &format!("{rows}@{size}, candidates and errors per pixel"));
+            print_summary(&step, &format!("{rows}@{size}, candidates and per-pixel errors"));
         }
     }
 }

@@ -1,9 +1,9 @@
 //! Measures the time per training step and per stage on random scenes.
 //!
-//! Runs on one, two and all threads, and on every adapter with each of its methods of accumulating
-//! gradients (software adapters: small scenes only). `cargo bench --bench stages [-- ROWS@SIZE] [avx2]`:
-//! `10000@256` selects one scene; `avx2` limits the CPU backend to AVX2. Times are medians: CPU time,
-//! which depends little on the load of the machine, wall time, and the wall time of each stage.
+//! The CPU backend runs on one, two and all threads, the GPU backend on every adapter with each of its methods of
+//! accumulating gradients (software adapters: small scenes only). `cargo bench --bench stages [-- ROWS@SIZE] [avx2]`:
+//! `10000@256` selects one scene; `avx2` limits the CPU backend to AVX2. Times are medians: CPU time
+//! (which depends little on the load of the machine), wall time, and the wall time of each stage.
 
 #![expect(clippy::print_stdout, reason = "the output is a table")]
 
@@ -19,8 +19,8 @@ use densify::render::{AdapterChoice, AdapterKind, Backend, BackendError, Setup};
 use pulp::{Arch, Simd, WithSimd};
 use steps::{median, ms};
 
-/// Multiply-adds on twelve independent vectors; two units with a latency of four cycles need eight such
-/// vectors to stay busy.
+/// Multiply-adds on twelve independent vectors. Two execution units with a latency of four cycles need at least
+/// eight such vectors to stay busy.
 struct MultiplyAdds {
     rounds: u32,
 }
@@ -44,7 +44,7 @@ impl WithSimd for MultiplyAdds {
     }
 }
 
-/// Peak performance of one thread: GFLOP/s, and GB/s read and written in place.
+/// Peak performance of one thread: arithmetic in GFLOP/s, and memory traffic in GB/s when updating an array in place.
 fn peak() -> (f64, f64) {
     let mut rates = (0.0_f64, 0.0_f64);
     let mut memory = vec![1.0_f32; 32 << 20];
@@ -64,7 +64,7 @@ fn peak() -> (f64, f64) {
     rates
 }
 
-/// Prints a line of medians over all steps but the first two.
+/// Measures training steps, and prints a line of medians over all steps except the first two.
 fn measure(backend: Result<Box<dyn Backend>, BackendError>, rows: usize, size: u32, device: &str) {
     let mut backend = match backend {
         Ok(backend) => backend,
@@ -76,7 +76,7 @@ fn measure(backend: Result<Box<dyn Backend>, BackendError>, rows: usize, size: u
     let (camera, target) = (steps::camera(size), steps::target(size));
     let (mut cpu, mut wall) = (Vec::new(), Vec::new());
     let mut stages: Vec<Vec<Duration>> = Vec::new();
-    let steps = steps::count(rows);
+    let steps = steps::step_count(rows);
     let mut entries = 0;
     for step in 1..=steps {
         let input = steps::input(step, &camera, &target);
@@ -111,7 +111,7 @@ fn measure(backend: Result<Box<dyn Backend>, BackendError>, rows: usize, size: u
 fn main() {
     let (flops, bytes) = peak();
     println!("one thread: peak of {flops:.0} GFLOP/s, {bytes:.0} GB/s read and written");
-    let only: Vec<String> = std::env::args().skip(1).filter(|a| a.contains('@')).collect();
+    let selected: Vec<String> = std::env::args().skip(1).filter(|a| a.contains('@')).collect();
     let avx2 = std::env::args().any(|arg| arg == "avx2");
     let instructions = if avx2 { InstructionSet::Avx2 } else { InstructionSet::Best };
     let usable = adapters().into_iter().filter(|a| a.missing.is_empty());
@@ -143,7 +143,7 @@ fn main() {
         (200_000, 800),
         (1_000_000, 1024),
     ] {
-        if !only.is_empty() && !only.contains(&format!("{rows}@{size}")) {
+        if !selected.is_empty() && !selected.contains(&format!("{rows}@{size}")) {
             continue;
         }
         let model = steps::scene(rows, 3);

@@ -2,7 +2,7 @@
 //!
 //! A *policy*, which is a plugin, decides where Gaussians are added and removed (see
 //! `densify_policies`). This crate is everything around it: data, renderer, trainer and the
-//! command line. All that `densify train` does can be done from code:
+//! command line. Everything that `densify train` does can be done from code:
 //!
 //! ```no_run
 //! use densify::run::{Budget, Occupied, Run, RunSpec, Silent};
@@ -24,12 +24,12 @@
 //! # }
 //! ```
 //!
-//! The layers are packages of their own, and each knows only those below it:
+//! Each layer is a package of its own and uses only the layers below it:
 //!
 //! | package | purpose | may depend on |
 //! |---|---|---|
 //! | [`cli`] | command-line arguments and messages | all below |
-//! | [`blocks`], [`compress`], [`launch`], … | tools that make several runs, or use finished ones | `run` and below |
+//! | [`blocks`], [`compress`], [`launch`], … | tools that make several runs, or use finished runs | `run` and below |
 //! | [`run`] | a run: its options, the values chosen for them, and its execution | all below |
 //! | [`train`] | the loop, schedule, metrics, checkpoints | all below |
 //! | [`render`] | rasterisers, native and on a GPU | `core`, policies, shaders |
@@ -37,7 +37,7 @@
 //! | [`core`] | cameras, Gaussians, memory ledger, atomic file writing | nothing of this workspace |
 //!
 //! Features, all on by default: `gpu` (the GPU backend), `selftest` (the float64 renderer and the command that
-//! compares with it), `study` (`compare`, `trade` and `report`), `view` (a page in the browser).
+//! compares backends with it), `study` (`compare`, `trade` and `report`), `view` (a page in the browser).
 
 pub use densify_blocks as blocks;
 pub use densify_cli as cli;

@@ -11,9 +11,9 @@ use glam::{DMat3, DVec3};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-/// A random cloud in front of the camera. The size of the Gaussians depends on their number such that
-/// there are as many tile entries per row as in a trained scene: about 3 at 10,000 rows and 256², 2.7 at
-/// 50,000 rows and 512².
+/// A random cloud of Gaussians in front of the camera. Their size depends on their number such that there are as
+/// many tile entries per row as in a trained scene: about 3 at 10,000 rows and 256² px, 2.7 at 50,000 rows and
+/// 512² px.
 pub(crate) fn scene(rows: usize, sh_degree: u8) -> Gaussians {
     let mut rng = ChaCha8Rng::seed_from_u64(rows as u64);
     let mut uniform = |from: f32, to: f32| rng.random_range(from..to);
@@ -29,6 +29,7 @@ pub(crate) fn scene(rows: usize, sh_degree: u8) -> Gaussians {
     model
 }
 
+/// A camera at distance 3 from the centre of the cloud, with a square image of side `size` `[px]`.
 pub(crate) fn camera(size: u32) -> Camera {
     let f = f64::from(size);
     Camera {
@@ -43,6 +44,7 @@ pub(crate) fn camera(size: u32) -> Camera {
     }
 }
 
+/// A square photograph of random pixels.
 pub(crate) fn target(size: u32) -> Image8 {
     let mut rng = ChaCha8Rng::seed_from_u64(1);
     let rgb = (0..3 * size * size).map(|_| rng.random::<u8>()).collect();
@@ -77,8 +79,8 @@ pub(crate) fn input<'a>(step: u32, camera: &'a Camera, target: &'a Image8) -> St
     }
 }
 
-/// Number of steps, of which the first two are not measured.
-pub(crate) fn count(rows: usize) -> u32 {
+/// Number of training steps to run; the first two are not measured.
+pub(crate) fn step_count(rows: usize) -> u32 {
     (6_000_000 / rows).clamp(7, 60) as u32
 }
 

@@ -48,7 +48,7 @@ impl Window {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct OpacityResets {
     regular: Window,
-    /// Step of the reset on a white background, if any.
+    /// Step of the additional reset of a scene on a white background.
     white: Option<u32>,
     /// Largest opacity after a reset, in (0, 1).
     max_opacity: f32,
@@ -98,9 +98,9 @@ pub fn concave_curve(window: Window, step: u32, start: usize, end: usize) -> usi
     }
     let events = (until.saturating_sub(from) / every).max(1);
     let event = (step / every).saturating_sub(from / every);
-    let x = (f64::from(event) / f64::from(events)).min(1.0);
+    let progress = (f64::from(event) / f64::from(events)).min(1.0);
     let (start, end) = (start as f64, end as f64);
-    (start + (end - start) * (2.0 * x - x * x)).floor() as usize
+    (start + (end - start) * (2.0 * progress - progress * progress)).floor() as usize
 }
 
 /// Divides a sum over views by the number of views that saw the row. 0 if no view saw it or the mean is not
@@ -242,15 +242,15 @@ mod tests {
     fn the_concave_curve_matches_values_worked_out_by_hand() {
         // M = 29: after the last event, the 28th at step 14,500, 1/29² of the growth is still missing.
         let window = Window { from: 500, until: 15_000, every: 500 };
-        let at = |step| concave_curve(window, step, 1000, 85_100);
+        let rows = |step| concave_curve(window, step, 1000, 85_100);
         // x = 1: 84,100·(2/29 − 1/841) = 84,100·57/841 = 5,700.
-        assert_eq!([at(500), at(1000), at(1500)], [1000, 6700, 12_200]);
-        assert_eq!([at(14_500), at(15_000), at(90_000)], [85_000, 85_100, 85_100]);
+        assert_eq!([rows(500), rows(1000), rows(1500)], [1000, 6700, 12_200]);
+        assert_eq!([rows(14_500), rows(15_000), rows(90_000)], [85_000, 85_100, 85_100]);
         // M = 145: after the 144th and last event, 1/145² of the growth is still missing.
         let frequent = Window { every: 100, ..window };
         assert_eq!(concave_curve(frequent, 14_900, 0, 145 * 145), 145 * 145 - 1);
         assert_eq!(concave_curve(Window { every: 0, ..window }, 900, 7, 9), 7);
-        // Nothing grows where the end is below the start.
+        // If the end is below the start, the curve falls and nothing grows.
         assert!(concave_curve(window, 1000, 100, 50) < 100);
     }
 
@@ -304,8 +304,8 @@ mod tests {
         assert_eq!(dead, [0, 2, 3]);
         spare_one(&mut dead, &opacity);
         assert_eq!(dead, [0, 2, 3]);
-        let mut none = Vec::new();
-        spare_one(&mut none, &[]);
-        assert!(none.is_empty());
+        let mut empty = Vec::new();
+        spare_one(&mut empty, &[]);
+        assert!(empty.is_empty());
     }
 }

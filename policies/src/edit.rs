@@ -41,16 +41,16 @@ pub enum ParentFate {
 pub enum Placement {
     /// New rows at the parent's mean + this offset `[scene units]`; a rewritten parent stays in place.
     Offset([f32; 3]),
-    /// Every child at mean + R·diag(s)·ξ, ξ ~ N(0, I), s the parent's scales
-    /// (original adaptive density control, Kerbl et al. 2023, section 5.2).
+    /// Every child at mean + R·diag(s)·ξ, where ξ ~ N(0, I) and s are the parent's scales (the original adaptive
+    /// density control, Kerbl et al. 2023, section 5.2).
     Sampled,
     /// Children at ±`sigmas`·s along the parent's longest axis: even children +, odd children −.
     LongAxis {
         /// Distance from the parent's mean in standard deviations of its longest axis.
         sigmas: f32,
     },
-    /// Children at ±R·diag(s)·v, v this many standard deviations along the parent's three axes: even
-    /// children +, odd children −.
+    /// Children at mean ± R·diag(s)·v, where v holds these numbers of standard deviations along the parent's three
+    /// axes: even children +, odd children −.
     Axes([f32; 3]),
 }
 
@@ -81,12 +81,12 @@ pub enum OpacityRule {
     Set(f32),
     /// Multiplied by this factor, in (0, 1].
     Scaled(f32),
-    /// 1 − (1 − o)^(1/n), n = children (+ 1 if the parent becomes a child): together the n are as
-    /// opaque as the parent was.
+    /// 1 − (1 − o)^(1/n), n = children (+ 1 if the parent becomes a child): together the n
+    /// Gaussians are as opaque as the parent was.
     Conserved,
 }
 
-/// A row rewritten in place; see [`Update::NONE`].
+/// The changes to a row that is rewritten in place; see [`Update::NONE`].
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Update {
     /// New opacity.
@@ -113,12 +113,12 @@ pub struct Decay {
     pub opacity: f32,
     /// Share by which standard deviations are reduced, in `[0, 1)`.
     pub scale: f32,
-    /// If true, only those rows decay that were visible in a view since the last reset of
+    /// If true, only rows decay that were visible in a view since the last reset of
     /// [`Signal::VisibleCount`](crate::signals::Signal::VisibleCount), which must then be declared.
     pub seen_only: bool,
 }
 
-/// Opacity at which [`Decay`] stops: far below the smallest alpha that is rendered, 1/255.
+/// Opacity below which [`Decay`] does not go: far below the smallest alpha that is rendered, 1/255.
 pub const MIN_DECAYED_OPACITY: f32 = 2e-4;
 
 /// Largest magnitude of a base colour: larger values would not fit the narrowest storage format.
@@ -146,7 +146,7 @@ pub enum Reset {
     /// All [`Signal`](crate::signals::Signal)s that accumulate. This excludes `WeightMax` (kept per epoch) and the
     /// current state of rows (`Opacity`, `ScaleMax`, `ScaleProduct`, `Age`, attributes).
     Signals,
-    /// The given signals, except those that do not accumulate; for signals with a reset interval of their own.
+    /// Those of the given signals that accumulate, for signals with a reset interval of their own.
     Only(SignalSet),
     /// The list of candidates.
     Candidates,
@@ -239,8 +239,8 @@ impl Update {
         keep_moments: true,
     };
 
-    /// Restarts the row in place: round, with this standard deviation `[scene units]` and opacity, its base
-    /// colour from all directions, and no moments.
+    /// Restarts the row in place: round, with this standard deviation `[scene units]` and opacity, the
+    /// same base colour from all directions, and zero moments.
     pub const fn restart(scale: f32, opacity: f32) -> Self {
         Self {
             opacity: OpacityRule::Set(opacity),
@@ -307,7 +307,7 @@ mod tests {
         let clone = crate::adc::clone_at([0.0; 3]);
         assert_eq!(clone.bad_field(), None);
         assert_eq!(Offspring { children: 0, ..clone }.bad_field(), Some("children"));
-        let at = |placement| Offspring { placement, ..clone }.bad_field();
+        let placed = |placement| Offspring { placement, ..clone }.bad_field();
         let scaled = |scale| Offspring { scale, ..clone }.bad_field();
         let opaque = |opacity| Offspring { opacity, ..clone }.bad_field();
         for bad in not_positive() {
@@ -320,14 +320,14 @@ mod tests {
             assert_eq!(opaque(OpacityRule::Scaled(bad)), Some("opacity"), "{bad}");
         }
         for bad in NOT_FINITE {
-            assert_eq!(at(Placement::LongAxis { sigmas: bad }), Some("placement"), "{bad}");
-            assert_eq!(at(Placement::Offset([0.0, bad, 0.0])), Some("placement"), "{bad}");
-            assert_eq!(at(Placement::Axes([0.0, 0.0, bad])), Some("placement"), "{bad}");
+            assert_eq!(placed(Placement::LongAxis { sigmas: bad }), Some("placement"), "{bad}");
+            assert_eq!(placed(Placement::Offset([0.0, bad, 0.0])), Some("placement"), "{bad}");
+            assert_eq!(placed(Placement::Axes([0.0, 0.0, bad])), Some("placement"), "{bad}");
             let turned = Offspring { turn: [1.0, bad, 0.0, 0.0], ..clone };
             assert_eq!(turned.bad_field(), Some("turn"), "{bad}");
         }
         assert_eq!(Offspring { turn: [0.0; 4], ..clone }.bad_field(), Some("turn"));
-        assert_eq!(at(Placement::LongAxis { sigmas: -1.0 }), Some("placement"));
+        assert_eq!(placed(Placement::LongAxis { sigmas: -1.0 }), Some("placement"));
         assert_eq!(opaque(OpacityRule::Set(1.0)), Some("opacity"));
         assert_eq!(opaque(OpacityRule::Scaled(1.0)), None);
     }
@@ -354,14 +354,14 @@ mod tests {
 
     #[test]
     fn a_bad_field_of_a_decay_is_named() {
-        let sound = Decay { opacity: 0.0, scale: 0.0, seen_only: false };
-        assert_eq!(sound.bad_field(), None);
+        let valid = Decay { opacity: 0.0, scale: 0.0, seen_only: false };
+        assert_eq!(valid.bad_field(), None);
         for bad in NOT_FINITE.into_iter().chain([-0.1]) {
-            assert_eq!(Decay { opacity: bad, ..sound }.bad_field(), Some("opacity"), "{bad}");
-            assert_eq!(Decay { scale: bad, ..sound }.bad_field(), Some("scale"), "{bad}");
+            assert_eq!(Decay { opacity: bad, ..valid }.bad_field(), Some("opacity"), "{bad}");
+            assert_eq!(Decay { scale: bad, ..valid }.bad_field(), Some("scale"), "{bad}");
         }
-        assert_eq!(Decay { scale: 1.0, ..sound }.bad_field(), Some("scale"));
-        assert_eq!(Decay { opacity: 2.0, scale: 0.999, ..sound }.bad_field(), None);
+        assert_eq!(Decay { scale: 1.0, ..valid }.bad_field(), Some("scale"));
+        assert_eq!(Decay { opacity: 2.0, scale: 0.999, ..valid }.bad_field(), None);
     }
 
     #[test]
@@ -370,18 +370,18 @@ mod tests {
         assert_eq!(Update::restart(0.0, 0.1).bad_field(), Some("scale"));
         assert_eq!(Update::restart(0.1, 1.0).bad_field(), Some("opacity"));
         assert_eq!(Update::NONE.bad_field(), None);
-        let wrong = |update: Update| update.bad_field();
+        let field = |update: Update| update.bad_field();
         let opacity = OpacityRule::Conserved;
-        assert_eq!(wrong(Update { opacity, ..Update::NONE }), Some("opacity"));
-        assert_eq!(wrong(Update { scale: ScaleRule::Uniform(0.0), ..Update::NONE }), Some("scale"));
+        assert_eq!(field(Update { opacity, ..Update::NONE }), Some("opacity"));
+        assert_eq!(field(Update { scale: ScaleRule::Uniform(0.0), ..Update::NONE }), Some("scale"));
         for bad in NOT_FINITE {
-            let three = Some([0.0, 0.0, bad]);
-            let position = Update { position: three, ..Update::NONE };
-            assert_eq!(wrong(position), Some("position"), "{bad}");
-            assert_eq!(wrong(Update { colour: three, ..Update::NONE }), Some("colour"), "{bad}");
+            let vector = Some([0.0, 0.0, bad]);
+            let position = Update { position: vector, ..Update::NONE };
+            assert_eq!(field(position), Some("position"), "{bad}");
+            assert_eq!(field(Update { colour: vector, ..Update::NONE }), Some("colour"), "{bad}");
         }
-        assert_eq!(wrong(Update { colour: Some([-1.5, 0.0, 2.0]), ..Update::NONE }), None);
+        assert_eq!(field(Update { colour: Some([-1.5, 0.0, 2.0]), ..Update::NONE }), None);
         let beyond = Some([0.0, 2.0 * COLOUR_MAX, 0.0]);
-        assert_eq!(wrong(Update { colour: beyond, ..Update::NONE }), Some("colour"));
+        assert_eq!(field(Update { colour: beyond, ..Update::NONE }), Some("colour"));
     }
 }

@@ -60,7 +60,7 @@ pub(crate) struct Event {
     pub(crate) views: Vec<View>,
 }
 
-/// An auxiliary view.
+/// An auxiliary view that the policy may observe before it plans.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct View {
     pub(crate) loss: f32,
@@ -100,7 +100,7 @@ impl Event {
         }
     }
 
-    /// Rows of opacity 0.5 and size 0.05 (small, as the extent is 10), seen by four views.
+    /// Rows of opacity 0.5 and largest standard deviation 0.05 (small, as the extent is 10), seen by four views.
     pub(crate) fn small_rows(step: u32, rows: usize, budget: usize) -> Self {
         Self::new(step, rows, budget)
             .with_all(Signal::VisibleCount, 4.0)
@@ -139,8 +139,8 @@ impl Event {
     /// Lets the policy plan, with exactly the signals and at most as many views as it requests.
     pub(crate) fn run_policy(&self, policy: &mut dyn DensityPolicy) -> PolicyResult<Outcome> {
         let request = policy.needs(&self.scene).aux.unwrap_or_default();
-        let wanted = policy.aux_views(self.step, self.rows, self.budget) as usize;
-        for view in self.views.iter().take(wanted) {
+        let views = policy.aux_views(self.step, self.rows, self.budget) as usize;
+        for view in self.views.iter().take(views) {
             let is_declared = |c: &AuxColumn| request.columns.contains(c);
             let columns = view.columns.iter().filter(|c| is_declared(&c.0)).cloned();
             let columns: Vec<_> = columns.collect();

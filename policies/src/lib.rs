@@ -38,8 +38,9 @@
 //! A policy is one file with five parts; the example below has all but the last.
 //!
 //! 1. **A manual page**: the leading `//!` block, with a table of the parameters. `densify policies NAME`
-//!    prints it, and [`conformance::check_manual`] compares it with the code. The cell `range` holds
-//!    `>= a`, `> a`, `a to b`, `a to b, both excluded` (or `a excluded`), a list of words, or nothing.
+//!    prints it, and [`conformance::check_manual`] compares it with the code. A cell in the column `range` holds
+//!    `>= a`, `> a`, `a to b` (optionally followed by `, a excluded`, `, b excluded` or `, both excluded`), a list of
+//!    words, or nothing.
 //! 2. **Parameters**: a struct with defaults, which `--policy-set NAME.parameter=value` overrides. Those
 //!    listed in [`STEP_PARAMETERS`](registry::ConfiguredPolicy::STEP_PARAMETERS), as a step or an interval,
 //!    scale with the length of the run.

@@ -1,7 +1,7 @@
 //! Nearest neighbours of points, by a k-d tree (Bentley 1975).
 
 /// Maximum number of points in a leaf of the tree, which is searched linearly.
-const LEAF: usize = 8;
+const LEAF_POINTS: usize = 8;
 /// Number of neighbours that distances are averaged over.
 const AVERAGED: usize = 3;
 
@@ -26,6 +26,7 @@ pub struct Neighbour {
 
 /// A search for the nearest neighbours of one point.
 struct Nearest<'a> {
+    /// Position of the point.
     at: [f64; 3],
     /// Index of the point, which is not its own neighbour.
     point: u32,
@@ -51,10 +52,10 @@ impl<'a> Neighbours<'a> {
     /// 0 if there are none.
     ///
     /// # Panics
-    /// When there is no such point.
+    /// When `index` is not the index of a point.
     pub fn mean_square_distance(&self, index: usize) -> f64 {
-        let mut found = [NOT_FOUND; AVERAGED];
-        let found = self.nearest(index, &mut found).iter();
+        let mut buffer = [NOT_FOUND; AVERAGED];
+        let found = self.nearest(index, &mut buffer).iter();
         let (count, sum) = found.fold((0.0, 0.0), |(n, sum), near| (n + 1.0, sum + near.square));
         if count > 0.0 { sum / count } else { 0.0 }
     }
@@ -70,18 +71,18 @@ impl<'a> Neighbours<'a> {
     pub fn for_each_nearest(&self, count: usize, mut visit: impl FnMut(usize, &[Neighbour])) {
         let count = count.min(self.points.len().saturating_sub(1));
         let mut buffer = vec![NOT_FOUND; count];
-        let mut before: Option<(usize, f64)> = None;
+        let mut previous: Option<(usize, f64)> = None;
         for &index in &self.order {
             let index = index as usize;
             // By the triangle inequality, the previous point's neighbours are within this bound, with a
             // margin for rounding.
-            let bound = before.map_or(f64::INFINITY, |(before, farthest)| {
-                let step = square(self.points[before], self.points[index]).sqrt();
+            let bound = previous.map_or(f64::INFINITY, |(previous, farthest)| {
+                let step = squared_distance(self.points[previous], self.points[index]).sqrt();
                 (farthest.sqrt() + step).powi(2) * (1.0 + 1e-9) + f64::MIN_POSITIVE
             });
             let found = self.nearest_below(index, bound, &mut buffer);
             visit(index, found);
-            before = found.last().filter(|_| found.len() == count).map(|last| (index, last.square));
+            previous = found.last().filter(|_| found.len() == count).map(|far| (index, far.square));
         }
     }
 
@@ -95,17 +96,17 @@ impl<'a> Neighbours<'a> {
         let (at, point) = (self.points[index], index as u32);
         if !buffer.is_empty() {
             let mut nearest = Nearest { at, point, found: &mut *buffer, bound };
-            self.visit(0, self.points.len(), [0.0; 3], &mut nearest);
+            self.search(0, self.points.len(), [0.0; 3], &mut nearest);
         }
         let count = buffer.iter().take_while(|other| other.square.is_finite()).count();
         &buffer[..count]
     }
 
     /// Searches a range of points whose box is at distance `outside` from the point of `nearest` along each axis.
-    fn visit(&self, from: usize, to: usize, outside: [f64; 3], nearest: &mut Nearest<'_>) {
-        if to - from <= LEAF {
+    fn search(&self, from: usize, to: usize, outside: [f64; 3], nearest: &mut Nearest<'_>) {
+        if to - from <= LEAF_POINTS {
             for &other in &self.order[from..to] {
-                nearest.take(self.points, other);
+                nearest.consider(self.points, other);
             }
             return;
         }
@@ -114,31 +115,31 @@ impl<'a> Neighbours<'a> {
         let beyond = nearest.at[axis] - self.points[self.order[middle] as usize][axis];
         let (near, far) = ((from, middle), (middle + 1, to));
         let (near, far) = if beyond < 0.0 { (near, far) } else { (far, near) };
-        self.visit(near.0, near.1, outside, nearest);
-        nearest.take(self.points, self.order[middle]);
+        self.search(near.0, near.1, outside, nearest);
+        nearest.consider(self.points, self.order[middle]);
         let mut outside = outside;
         outside[axis] = beyond;
         // Equality must not count, or coinciding points would all be visited.
-        if square(outside, [0.0; 3]) < nearest.bound {
-            self.visit(far.0, far.1, outside, nearest);
+        if squared_distance(outside, [0.0; 3]) < nearest.bound {
+            self.search(far.0, far.1, outside, nearest);
         }
     }
 }
 
-fn square(a: [f64; 3], b: [f64; 3]) -> f64 {
+fn squared_distance(a: [f64; 3], b: [f64; 3]) -> f64 {
     let [x, y, z] = [a[0] - b[0], a[1] - b[1], a[2] - b[2]];
     x * x + y * y + z * z
 }
 
 fn split(points: &[[f64; 3]], order: &mut [u32], axes: &mut [u8]) {
-    if order.len() <= LEAF {
+    if order.len() <= LEAF_POINTS {
         return;
     }
     let middle = order.len() / 2;
     let width = |axis: usize| {
-        let at = order.iter().map(|&index| points[index as usize][axis]);
+        let xs = order.iter().map(|&index| points[index as usize][axis]);
         let (low, high) =
-            at.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), x| (low.min(x), high.max(x)));
+            xs.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), x| (low.min(x), high.max(x)));
         high - low
     };
     let widths = [width(0), width(1), width(2)];
@@ -154,20 +155,20 @@ fn split(points: &[[f64; 3]], order: &mut [u32], axes: &mut [u8]) {
 }
 
 impl Nearest<'_> {
-    fn take(&mut self, points: &[[f64; 3]], index: u32) {
-        let square = square(points[index as usize], self.at);
+    fn consider(&mut self, points: &[[f64; 3]], index: u32) {
+        let square = squared_distance(points[index as usize], self.at);
         // False for NaN.
         let is_below = square < self.bound;
         if index == self.point || !is_below {
             return;
         }
         let last = self.found.len() - 1;
-        let mut place = last;
-        while place > 0 && square < self.found[place - 1].square {
-            self.found[place] = self.found[place - 1];
-            place -= 1;
+        let mut rank = last;
+        while rank > 0 && square < self.found[rank - 1].square {
+            self.found[rank] = self.found[rank - 1];
+            rank -= 1;
         }
-        self.found[place] = Neighbour { square, index };
+        self.found[rank] = Neighbour { square, index };
         self.bound = self.bound.min(self.found[last].square);
     }
 }
@@ -206,15 +207,15 @@ mod tests {
     #[test]
     fn the_tree_agrees_with_a_full_search() {
         let points = clustered();
-        let found = mean_square_distances(&points);
+        let means = mean_square_distances(&points);
         for (i, a) in points.iter().enumerate() {
             let square = |b: &[f64; 3]| (0..3).map(|k| (a[k] - b[k]).powi(2)).sum();
             let others = points.iter().enumerate().filter(|(j, _)| *j != i);
             let mut all: Vec<f64> = others.map(|(_, b)| square(b)).collect();
             all.sort_by(f64::total_cmp);
             let expected = all[..3].iter().sum::<f64>() / 3.0;
-            let found = found[i];
-            assert!((found - expected).abs() <= 1e-12 * expected, "{i}: {found} {expected}");
+            let mean = means[i];
+            assert!((mean - expected).abs() <= 1e-12 * expected, "{i}: {mean} {expected}");
         }
     }
 
@@ -246,10 +247,10 @@ mod tests {
                     let expected = square(a, &points[other.index as usize]);
                     assert_eq!(other.square.to_bits(), expected.to_bits());
                 }
-                let mut places: Vec<u32> = found.iter().map(|other| other.index).collect();
-                places.sort_unstable();
-                places.dedup();
-                assert!(places.len() == found.len() && !places.contains(&(i as u32)));
+                let mut indices: Vec<u32> = found.iter().map(|other| other.index).collect();
+                indices.sort_unstable();
+                indices.dedup();
+                assert!(indices.len() == found.len() && !indices.contains(&(i as u32)));
             }
         }
     }

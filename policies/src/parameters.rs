@@ -11,7 +11,7 @@ use crate::policy::{PolicyError, PolicyResult};
 pub const REFERENCE_ITERATIONS: u32 = 30_000;
 
 /// Largest magnitude of a parameter, so that products of parameters are finite as `f32`.
-const LARGEST: f64 = 1e30;
+const MAX_MAGNITUDE: f64 = 1e30;
 
 /// Checks, for [`ConfiguredPolicy::new`], that a parameter is in its range, also when rounded to `f32`, and at
 /// most 1e30 in magnitude. The registry adds the policy's name to the error.
@@ -24,7 +24,7 @@ pub fn in_range(parameter: &str, value: f64, range: impl RangeBounds<f64>) -> Po
     let [is_in_range, is_in_range_rounded] =
         [value, f64::from(value as f32)].map(|value| range.contains(&value));
     // False for NaN.
-    let is_moderate = value.abs() <= LARGEST;
+    let is_moderate = value.abs() <= MAX_MAGNITUDE;
     if is_in_range && is_in_range_rounded && is_moderate {
         return Ok(());
     }
@@ -40,7 +40,7 @@ pub fn in_range(parameter: &str, value: f64, range: impl RangeBounds<f64>) -> Po
         Bound::Unbounded => {}
     }
     if !is_moderate {
-        limits.push(format!("at most {LARGEST:e} in magnitude"));
+        limits.push(format!("at most {MAX_MAGNITUDE:e} in magnitude"));
     }
     let limits = limits.join(" and ");
     let reason = if is_in_range {
@@ -71,7 +71,7 @@ pub fn parse_value(text: &str) -> Value {
     single.and_then(|mut table| table.remove("value")).unwrap_or_else(|| text.into())
 }
 
-/// Shortest interval after scaling `[steps]`. Between two events rows must be seen from many views, and
+/// Shortest interval after scaling `[steps]`. Between two events, rows must be seen in many views, and
 /// new rows must converge, which takes as many steps in a short run as in a long one.
 const MIN_INTERVAL: i64 = 100;
 
@@ -85,7 +85,7 @@ pub enum StepParameter {
     Interval(&'static str),
 }
 
-/// Concatenates the step parameters of another policy, `first`, and `more`, N in total.
+/// Concatenates `first`, the step parameters of another policy, and `more`; N is the total number.
 ///
 /// # Panics
 /// When the total is not N. In a constant this is a compile error.

@@ -27,7 +27,7 @@ impl ViewAccumulator {
         self.combine(step, values, |sum, value| sum + value);
     }
 
-    /// Raises the values so far to those of a view of `step` where these are larger. Shape: `[rows]`.
+    /// Raises each value to that of a view of `step` if that is larger. Shape: `[rows]`.
     pub fn maximum(&mut self, step: u32, values: &[f32]) {
         self.combine(step, values, f32::max);
     }
@@ -38,14 +38,14 @@ impl ViewAccumulator {
         (step == now.step && values.len() == now.rows()).then_some(values)
     }
 
-    fn combine(&mut self, step: u32, values: &[f32], with: impl Fn(f32, f32) -> f32) {
+    fn combine(&mut self, step: u32, values: &[f32], merge: impl Fn(f32, f32) -> f32) {
         if self.step != step || self.values.len() != values.len() {
             *self = Self { step, values: vec![0.0; values.len()] };
         }
         for (so_far, &value) in self.values.iter_mut().zip(values) {
             // Skips NaN, too.
             if value > 0.0 {
-                *so_far = with(*so_far, value);
+                *so_far = merge(*so_far, value);
             }
         }
     }
@@ -55,9 +55,9 @@ impl ViewAccumulator {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Victims {
-    /// The rows with the lowest measure.
+    /// The rows with the lowest values of the measure.
     Lowest,
-    /// The same number, drawn uniformly at random, as a control.
+    /// The same number of rows, drawn uniformly at random, as a control.
     Random,
 }
 
@@ -68,8 +68,8 @@ impl Victims {
     /// # Panics
     /// For `Lowest`, when `measure` has fewer values than the model has rows.
     pub fn prune(self, plan: &mut EditPlan, measure: &[f32], count: usize, rng: &PolicyRng) {
-        let left = plan.rows() - plan.pruned();
-        let count = count.min(left.saturating_sub(1));
+        let rows_left = plan.rows() - plan.pruned();
+        let count = count.min(rows_left.saturating_sub(1));
         let rows = 0..plan.rows() as u32;
         let victims = match self {
             Self::Lowest => {

@@ -7,8 +7,8 @@ pub(crate) fn share_of_budget(share: f64, budget: usize) -> usize {
     floor(share * budget as f64)
 }
 
-/// Number of rows for the event of `window` at `step`: ⌊`share` · `budget`⌋, divided equally among all events
-/// except for rounding.
+/// Number of rows for the event of `window` at `step`: its part of ⌊`share` · `budget`⌋, which is divided among
+/// all events as equally as rounding permits.
 pub(crate) fn event_quota(share: f64, window: Window, step: u32, budget: usize) -> usize {
     let events = f64::from(window.count(u32::MAX).max(1));
     let quota_through =

@@ -20,7 +20,7 @@ pub enum Purpose {
     Round = 5,
 }
 
-/// Random draws of one policy event.
+/// The random draws at one event of a policy.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct PolicyRng {
     seed: u32,
@@ -174,8 +174,8 @@ mod tests {
                 (at(0), at(1))
             }),
         ];
-        let found = pairs.map(|(name, pair)| (name, joint_deviation(pair)));
-        let bad: Vec<_> = found.iter().filter(|(_, deviation)| deviation.abs() > 5.0).collect();
+        let deviations = pairs.map(|(name, pair)| (name, joint_deviation(pair)));
+        let bad: Vec<_> = deviations.iter().filter(|(_, d)| d.abs() > 5.0).collect();
         assert!(bad.is_empty(), "{bad:?}");
     }
 
@@ -191,9 +191,9 @@ mod tests {
             // Five standard errors of each moment of n standard normals.
             let moments = [(1, 0.0, 1.0), (2, 1.0, 2.0), (3, 0.0, 15.0), (4, 3.0, 96.0)];
             for (power, expected, variance) in moments {
-                let found = mean(&|d| d[axis].powi(power));
+                let moment = mean(&|d| d[axis].powi(power));
                 let bound = 5.0 * f64::sqrt(variance / n);
-                assert!((found - expected).abs() < bound, "axis {axis}, moment {power}: {found}");
+                assert!((moment - expected).abs() < bound, "axis {axis}, moment {power}: {moment}");
             }
             let covariance = mean(&|d| d[axis] * d[(axis + 1) % 3]);
             assert!(covariance.abs() < 5.0 / n.sqrt(), "axis {axis}: {covariance}");

@@ -37,12 +37,12 @@ pub fn smallest(rows: Vec<u32>, values: &[f32], k: usize) -> Vec<u32> {
 /// Draws `k` distinct rows without replacement, each with a probability proportional to its weight among the
 /// remaining ones. Returned in the order drawn; fewer than `k` if fewer weights are positive.
 ///
-/// The rows with the smallest −ln(u) / weight are drawn, an exponential variable whose rate is the
+/// The rows with the smallest keys −ln(u) / weight are drawn; a key is an exponential variable whose rate is the
 /// weight (Efraimidis and Spirakis, *Weighted random sampling with a reservoir*, 2006). Rows with zero,
 /// negative or NaN weights are never drawn; those with infinite weights always come first.
 pub fn weighted(weights: &[f32], k: usize, rng: &PolicyRng) -> Vec<u32> {
-    let drawn = (0..).zip(weights).filter(|(_, weight)| **weight > 0.0);
-    let keyed = drawn.map(|(row, &weight)| {
+    let eligible = (0..).zip(weights).filter(|(_, weight)| **weight > 0.0);
+    let keyed = eligible.map(|(row, &weight)| {
         let u: f64 = rng.uniform_f64(row, Purpose::Select);
         (-u.ln() / f64::from(weight), row)
     });
@@ -70,8 +70,8 @@ pub fn with_replacement(weights: &[f32], k: usize, rng: &PolicyRng) -> Vec<(u32,
     }
     let mut drawn: Vec<u32> = (0..k as u32)
         .map(|draw| {
-            let at = rng.uniform_f64(draw, Purpose::Draw) * total;
-            let row = sums.partition_point(|&sum| sum <= at);
+            let target = rng.uniform_f64(draw, Purpose::Draw) * total;
+            let row = sums.partition_point(|&sum| sum <= target);
             // The product may round up to the total; then the last row with a positive weight is drawn.
             row.min(sums.partition_point(|&sum| sum < total)) as u32
         })
@@ -83,8 +83,8 @@ pub fn with_replacement(weights: &[f32], k: usize, rng: &PolicyRng) -> Vec<(u32,
 /// The linearly interpolated `share` quantile of the finite values; `None` if there are none.
 pub fn quantile(values: &[f32], share: f64) -> Option<f64> {
     let mut finite: Vec<f32> = values.iter().copied().filter(|value| value.is_finite()).collect();
-    let place = share * finite.len().checked_sub(1)? as f64;
-    let (below, between) = (place.floor() as usize, place.fract());
+    let rank = share * finite.len().checked_sub(1)? as f64;
+    let (below, between) = (rank.floor() as usize, rank.fract());
     let (_, &mut low, above) = finite.select_nth_unstable_by(below, f32::total_cmp);
     let high = above.iter().copied().min_by(f32::total_cmp).unwrap_or(low);
     Some(f64::from(low) + between * (f64::from(high) - f64::from(low)))
@@ -151,9 +151,9 @@ mod tests {
     #[test]
     fn quantiles_match_values_worked_out_by_hand() {
         let values = [5.0, NAN, 1.0, 2.0, f32::INFINITY, 4.0];
-        // Of 1, 2, 4, 5: places 0, 0.75, 1.5 and 3.
-        let found = [0.0, 0.25, 0.5, 1.0].map(|share| quantile(&values, share));
-        assert_eq!(found, [1.0, 1.75, 3.0, 5.0].map(Some));
+        // Among 1, 2, 4 and 5, these shares are at ranks 0, 0.75, 1.5 and 3.
+        let quantiles = [0.0, 0.25, 0.5, 1.0].map(|share| quantile(&values, share));
+        assert_eq!(quantiles, [1.0, 1.75, 3.0, 5.0].map(Some));
         assert_eq!((quantile(&[], 0.5), quantile(&[NAN], 0.5)), (None, None));
     }
 

@@ -10,17 +10,17 @@ pub enum SignalKind {
     /// Summed over the views in which the row was visible since the last
     /// [`Reset::Signals`](crate::plan::Reset::Signals), or since the row was created.
     Sum,
-    /// An integer sum over the same views.
+    /// Like [`Sum`](Self::Sum), but an integer.
     Count,
     /// The largest value of the previous and the current epoch.
     EpochMaximum,
-    /// The largest value of a view since the last reset, or since the row was created.
+    /// The largest value in any view since the last reset, or since the row was created.
     Maximum,
-    /// The smallest value of a view in which the row was visible, over the same time; +∞ if there was none.
+    /// The smallest value in any view in which the row was visible, over the same time; +∞ if there was none.
     Minimum,
     /// Computed from the current parameters or age of the row; needs no memory.
     Current,
-    /// Current parameters of the row, this many numbers, copied only at events; needs no memory in between.
+    /// Current parameters of the row, as many numbers as given, copied only at events; needs no memory in between.
     Attribute(usize),
 }
 
@@ -87,13 +87,13 @@ signals! {
     /// Number of views whose image the row's projection overlaps, >= 0.
     VisibleCount: Count "views" [];
     /// Sum over views of ‖dL/d(mean in NDC)‖₂, >= 0. NDC gradient = pixel gradient · (W/2, H/2).
-    /// [`Needs::full_depth`](crate::policy::Needs::full_depth) reduces the weight of near views in
-    /// this sum and in the next two.
+    /// [`Needs::full_depth`](crate::policy::Needs::full_depth) reduces the weight of near views in this sum, in
+    /// [`ScreenGradientAbs`](Self::ScreenGradientAbs) and in [`ColourGradient`](Self::ColourGradient).
     ScreenGradient: Sum "1" [];
     /// Sum over views of ‖Σ over pixels |dL/d(mean in NDC)|‖₂ (absolute per axis, AbsGS), >= 0.
     ScreenGradientAbs: Sum "1" [AbsGradient];
-    /// Sum over views of ‖dL/dc‖₂, c the row's view-dependent colour as blended, >= 0. Ignores the clamp at 0,
-    /// so that a row clamped to black also has a gradient.
+    /// Sum over views of ‖dL/dc‖₂, >= 0, where c is the row's view-dependent colour as blended. Ignores the clamp
+    /// at 0, so that a row clamped to black also has a gradient.
     ColourGradient: Sum "1" [];
     /// x of the sum over views of dL/d(mean) `[1 / scene units]`.
     MeanGradientX: Sum "1 / scene units" [];
@@ -109,14 +109,14 @@ signals! {
     WeightSum: Sum "pixels" [Weight];
     /// Number of pixels the row was blended into, >= 0.
     PixelCount: Count "pixels" [Count];
-    /// Sum over all pixels of α·T·e, >= 0, e the pixel's part of the training loss:
-    /// 0.8·|I − G| + 0.2·(1 − SSIM), the mean over channels. Divided by
+    /// Sum over all pixels of α·T·e, >= 0, where e is the pixel's part of the training loss:
+    /// 0.8·|I − G| + 0.2·(1 − SSIM), averaged over channels. Divided by
     /// [`WeightSum`](Self::WeightSum) it is the mean error where the row is visible. The error map and pixel
     /// weights of [`Needs::error_score`](crate::policy::Needs::error_score) apply to this sum, too.
     WeightedError: Sum "pixels" [WeightedError];
     /// Sum over views of the row's error, >= 0, as defined by [`ErrorScore`](crate::policy::ErrorScore).
     ErrorScore: Sum "1" [Weight, WeightedError];
-    /// Sum over views of √w, w the row's largest blend weight α·T of the view, >= 0. Divided by
+    /// Sum over views of √w, >= 0, where w is the row's largest blend weight α·T in the view. Divided by
     /// [`VisibleCount`](Self::VisibleCount) it tells how much a row matters in all views that see it,
     /// whereas a single view determines [`WeightMax`](Self::WeightMax).
     WeightMaxRoot: Sum "1" [LargestWeight];
@@ -126,7 +126,8 @@ signals! {
     DepthMin: Minimum "scene units" [];
     /// Smallest width of a pixel at the depth of the mean, depth / focal length `[scene units]`, > 0.
     PixelSizeMin: Minimum "scene units" [];
-    /// Largest share of a view's pixels that the row dominates: no other has a larger blend weight. In `[0, 1]`.
+    /// Largest share of a view's pixels, in `[0, 1]`, that the row dominates: no other row has a larger blend
+    /// weight there.
     DominantPixels: Maximum "image" [];
     /// Current opacity, in (0, 1).
     Opacity: Current "1" [];
@@ -146,8 +147,8 @@ signals! {
     /// Natural logarithms of the three current standard deviations `[ln scene units]`, along the axes of
     /// [`Orientation`](Self::Orientation).
     LogScale: Attribute(3) "ln scene units" [];
-    /// Current orientation: a quaternion q = (w, x, y, z) of any length but 0. The columns of R(q) are the row's
-    /// axes in scene coordinates.
+    /// Current orientation: a quaternion q = (w, x, y, z) of any length but 0. The columns of its
+    /// rotation matrix R(q) are the row's axes in scene coordinates.
     Orientation: Attribute(4) "1" [];
     /// Current base colour (band 0): red, green and blue, sRGB-encoded; not bounded to `[0, 1]`.
     Colour: Attribute(3) "1" [];
@@ -274,22 +275,22 @@ impl Signals {
     /// Removes the first `rows` rows in place.
     ///
     /// # Panics
-    /// When there are fewer.
+    /// When there are fewer than `rows`.
     #[must_use]
     pub fn without_first(mut self, rows: usize) -> Self {
         assert!(rows <= self.rows, "without {rows} of {} rows", self.rows);
         if rows == 0 {
             return self;
         }
-        let left = self.rows - rows;
+        let rows_left = self.rows - rows;
         let (mut from, mut to) = (0, 0);
         for width in self.set.iter().map(Signal::width) {
             self.values.copy_within(from + width * rows..from + width * self.rows, to);
             from += width * self.rows;
-            to += width * left;
+            to += width * rows_left;
         }
         self.values.truncate(to);
-        self.rows = left;
+        self.rows = rows_left;
         self
     }
 
@@ -310,7 +311,7 @@ impl Signals {
 /// blended into; all columns are 0 for rows that are not on screen.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub enum AuxColumn {
-    /// Sum of the pixel map, not weighted by alpha, >= 0.
+    /// Sum of the values of the [pixel map](crate::policy::PixelMap), not weighted by alpha, >= 0.
     MapSum,
     /// Number of pixels, >= 0.
     PixelCount,

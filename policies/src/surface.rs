@@ -1,15 +1,16 @@
 //! Replacing a model by surface points seen in the training views, and sizes for restarted rows.
 //!
-//! *Mini-Splatting*, Fang and Wang 2024, "depth reinitialization" and the restart after sampling, as in its
-//! published code and that of diet.
+//! These are the "depth reinitialization" and the restart after sampling of *Mini-Splatting* (Fang and Wang 2024),
+//! as in the published code of Mini-Splatting and of diet.
 
 use crate::neighbours::Neighbours;
 use crate::plan::{EditPlan, Reset, Seed};
 use crate::policy::Candidate;
 
-/// Smallest size of a row, in extents, as in the initialisation: closer points count as the same surface point.
+/// Smallest size of a row, as a fraction of the scene extent and as in the initialisation: closer points count as the
+/// same surface point.
 const LEAST_DISTANCE: f64 = 2e-4;
-/// Size of a row without neighbours, in extents.
+/// Size of a row without neighbours, as a fraction of the scene extent.
 const LONE_SIZE: f64 = 0.02;
 
 /// The standard deviations of round rows at these positions: the root mean square distance to the three nearest
@@ -24,8 +25,8 @@ pub fn sizes(positions: &[[f64; 3]], extent: f32) -> Vec<f32> {
     (0..positions.len()).map(|index| size(index) as f32).collect()
 }
 
-/// Replaces all rows by at most `max_rows` of the surface points, with this opacity. If no point is valid, the
-/// model is kept.
+/// Replaces all rows by rows of this opacity at the valid surface points, at most `max_rows`. If no point is valid,
+/// the model is kept.
 pub fn replace_model(
     points: &[Candidate],
     max_rows: usize,
@@ -66,10 +67,10 @@ mod tests {
 
     #[test]
     fn sizes_are_distances_to_neighbours() {
-        // A line: the first has neighbours at 1, 3 and 6: √(46/3).
+        // On a line, the first point has neighbours at 1, 3 and 6: √(46/3).
         let line = [[0.0; 3], [1.0, 0.0, 0.0], [3.0, 0.0, 0.0], [6.0, 0.0, 0.0]];
-        let found = sizes(&line, 1.0);
-        assert!((found[0] - (46.0_f32 / 3.0).sqrt()).abs() < 1e-6, "{found:?}");
+        let of_line = sizes(&line, 1.0);
+        assert!((of_line[0] - (46.0_f32 / 3.0).sqrt()).abs() < 1e-6, "{of_line:?}");
         // Coinciding points get 2e-4 of the extent, a single point 0.02 of it.
         assert_eq!(sizes(&[[1.0; 3]; 3], 10.0), [2e-3; 3]);
         assert_eq!(sizes(&[[1.0; 3]], 10.0), [0.2]);

@@ -46,7 +46,7 @@ fn mesh(count: usize) -> Model {
     model
 }
 
-/// Best of five runs over all rays, in millions of rays per second.
+/// The highest speed of five runs over all rays, in millions of rays per second.
 fn speed<T>(rays: &[T], cast: impl Fn(&T)) -> f64 {
     let best = (0..5)
         .map(|_| {
@@ -74,7 +74,7 @@ fn main() {
         let model = mesh(count);
         let start = Instant::now();
         let surface = Surface::new(&model).expect("triangles");
-        let built = start.elapsed();
+        let build_time = start.elapsed();
         let corner = |i: u32| Vec3A::from(model.positions[i as usize].as_vec3());
         let triangles: Vec<Triangle> = model
             .triangles
@@ -88,7 +88,7 @@ fn main() {
         let start = Instant::now();
         let (params, mut time) = (BvhBuildParams::medium_build, Duration::default());
         let wide = build_cwbvh_from_tris(&triangles, params(), &mut time);
-        let wide_built = start.elapsed();
+        let wide_build_time = start.elapsed();
         let binary = build_bvh2_from_tris(&triangles, params(), &mut time);
         let in_order = |order: &[u32]| -> Vec<Triangle> {
             order.iter().map(|&i| triangles[i as usize]).collect()
@@ -113,8 +113,8 @@ fn main() {
             "{:9}  {ours:12.2}  {cwbvh:5.2}  {bvh2:4.2}  {:11.0}%  {:8.2} s  {:9.2} s",
             model.triangles.len(),
             100.0 * ours / cwbvh.max(bvh2),
-            built.as_secs_f64(),
-            wide_built.as_secs_f64(),
+            build_time.as_secs_f64(),
+            wide_build_time.as_secs_f64(),
         );
     }
 }

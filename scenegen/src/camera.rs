@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 use crate::error::Error;
 use crate::lens::Lens;
 
-/// A camera, a pinhole unless it has a lens. OpenCV axes: x right, y down, z forward; pixel centres at +0.5.
+/// A camera: a pinhole camera unless it has a lens. OpenCV axes: x right, y down, z forward; pixel centres at +0.5.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Camera {
     /// Image width `[px]`, >= 1.
@@ -44,7 +44,7 @@ impl Camera {
         (width, height): (u32, u32),
     ) -> Self {
         let forward = (target - centre).normalize_or(DVec3::NEG_Z);
-        // If it looks along `up`, any horizontal direction will do.
+        // If the camera looks along `up`, any perpendicular direction will do.
         let right = forward.cross(up).normalize_or(forward.any_orthonormal_vector());
         let down = forward.cross(right);
         let focal = 0.5 * f64::from(width) / (0.5 * fov_x).tan();
@@ -62,11 +62,12 @@ impl Camera {
         Self { width, height, fx: focal, fy: focal, cx, cy, world_from_camera, centre, lens: None }
     }
 
-    /// This pinhole camera with a lens. The field of view between the middles of the left and right edges is
+    /// Adds a lens to a pinhole camera. The field of view between the middles of the left and right edges is
     /// unchanged.
     ///
     /// # Errors
-    /// When the lens images two directions at the same point, or its field is narrower than the image.
+    /// When the lens images two directions at the same point of the image, or its field of view is narrower than the
+    /// image.
     pub(crate) fn with_lens(self, lens: Lens) -> Result<Self, Error> {
         let half = 0.5 * f64::from(self.width);
         let slope = half / self.fx;
@@ -83,7 +84,7 @@ impl Camera {
             return Err(Error::option(
                 "--lens",
                 format!(
-                    "{lens} can be inverted within {field:.0} degrees only, and the image is wider from corner \
+                    "{lens} can be inverted only within {field:.0} degrees, but the image is wider from corner \
                      to corner; lower --fov or the coefficients"
                 ),
             ));
@@ -105,7 +106,7 @@ impl Camera {
         self.world_from_camera.z_axis
     }
 
-    /// Image point `[px]` and depth of a point in the world.
+    /// The image point `[px]` and the depth of a point in the world.
     pub fn project(&self, world: DVec3) -> (DVec2, f64) {
         let offset = world - self.centre;
         let m = &self.world_from_camera;
@@ -164,7 +165,7 @@ mod tests {
     }
 
     #[test]
-    fn lenses_that_fold_over_in_the_image_are_refused() {
+    fn lenses_that_cannot_be_inverted_within_the_image_are_refused() {
         for (text, fov) in
             [("radial:-0.9", 70.0), ("fisheye:0,-2", 90.0), ("fisheye:0,-0.3", 150.0)]
         {

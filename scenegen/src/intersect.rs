@@ -2,7 +2,7 @@
 //!
 //! Woop, Benthin and Wald, "Watertight Ray/Triangle Intersection" (JCGT 2013): the triangle is
 //! sheared into the ray's space, where two triangles that share an edge evaluate exactly the same
-//! products for it with opposite signs, so that a ray cannot pass between them. If an edge function is
+//! products for this edge with opposite signs, so that a ray cannot pass between them. If an edge function is
 //! exactly zero, all three are evaluated again in f64, in which the products are exact.
 
 use glam::Vec3;
@@ -11,9 +11,11 @@ use glam::Vec3;
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct ShearedRay {
     pub(crate) origin: Vec3,
+    /// `kx`, `ky` and `kz` are the coordinate axes that are x, y and z of the ray's space.
     kx: usize,
     ky: usize,
     kz: usize,
+    /// Shears of x and y along z, and scale of z.
     pub(crate) shear: Vec3,
 }
 
@@ -22,16 +24,16 @@ pub(crate) struct ShearedRay {
 pub(crate) struct Intersection {
     /// Ray parameter.
     pub(crate) t: f32,
-    /// Weight of the second vertex.
+    /// Barycentric weight of the second vertex.
     pub(crate) v: f32,
-    /// Weight of the third vertex.
+    /// Barycentric weight of the third vertex.
     pub(crate) w: f32,
     /// True if the vertices are counter-clockwise as seen along the ray.
     pub(crate) front: bool,
 }
 
 impl ShearedRay {
-    /// `direction` must be finite and not zero.
+    /// Prepares a ray; `direction` must be finite and not zero.
     #[inline]
     pub(crate) fn new(origin: Vec3, direction: Vec3) -> Self {
         let size = direction.abs();
@@ -43,7 +45,7 @@ impl ShearedRay {
             2
         };
         let (mut kx, mut ky) = ((kz + 1) % 3, (kz + 2) % 3);
-        // Preserves the winding.
+        // Swapping two axes preserves the winding.
         if direction[kz] < 0.0 {
             std::mem::swap(&mut kx, &mut ky);
         }

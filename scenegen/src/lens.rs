@@ -1,7 +1,7 @@
 //! Lenses with distortion, as in phones and action cameras.
 //!
-//! Images are computed by the formula and rays by bisection, independently of the trainer's code, so that
-//! these images test the trainer's undistortion.
+//! The image of a ray is computed by the formula, and the ray of an image point by bisection, independently of the
+//! trainer's code, so that rendered images test the trainer's undistortion.
 
 use std::fmt;
 use std::str::FromStr;
@@ -11,12 +11,12 @@ use serde::{Deserialize, Serialize};
 
 /// Maximum number of coefficients.
 const MAX_COEFFICIENTS: usize = 4;
-/// Largest angle from the axis that a lens may image `[degrees]`: beyond it depths become meaningless.
+/// Largest angle from the axis that a lens may image `[degrees]`. Beyond it, depths along the axis are meaningless.
 const MAX_ANGLE: f64 = 85.0;
-/// Steps at which a lens is tested for being monotonic.
+/// Number of angles at which a lens is tested for monotonicity.
 const STEPS: u32 = 2000;
 
-/// The projection of the angle from the axis.
+/// The projection of a lens: the distance from the image's centre at which an angle from the axis is imaged.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum LensKind {
@@ -29,14 +29,14 @@ pub enum LensKind {
 /// A radially symmetric lens.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Lens {
-    /// Projection.
+    /// Kind of projection.
     pub kind: LensKind,
-    /// Coefficients; unused ones are 0.
+    /// Distortion coefficients k₁ to k₄; unused ones are 0.
     pub k: [f64; MAX_COEFFICIENTS],
 }
 
 impl LensKind {
-    /// Name on the command line, and maximum number of coefficients.
+    /// All kinds, with their names on the command line and maximum numbers of coefficients.
     const ALL: [(Self, &'static str, usize); 2] =
         [(Self::Fisheye, "fisheye", MAX_COEFFICIENTS), (Self::Radial, "radial", 2)];
 }
@@ -53,10 +53,10 @@ impl Lens {
         r * (1.0 + s * (a + s * (b + s * (c + s * d))))
     }
 
-    /// The angle `[rad]` that is imaged at distance `radius`; the largest angle if none is.
+    /// The angle `[rad]` that is imaged at distance `radius`, at most [`MAX_ANGLE`].
     fn angle(&self, radius: f64) -> f64 {
         let (mut low, mut high) = (0.0, MAX_ANGLE.to_radians());
-        // 60 halvings reduce the interval below rounding.
+        // 60 halvings make the interval smaller than the rounding error.
         for _ in 0..60 {
             let middle = 0.5 * (low + high);
             if self.radius(middle) < radius { low = middle } else { high = middle }
@@ -87,8 +87,8 @@ impl Lens {
 impl fmt::Display for Lens {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let entry = LensKind::ALL.iter().find(|(kind, ..)| *kind == self.kind);
-        let (_, name, most) = entry.copied().unwrap_or(LensKind::ALL[0]);
-        let numbers: Vec<String> = self.k[..most].iter().map(ToString::to_string).collect();
+        let (_, name, max_count) = entry.copied().unwrap_or(LensKind::ALL[0]);
+        let numbers: Vec<String> = self.k[..max_count].iter().map(ToString::to_string).collect();
         write!(f, "{name}:{}", numbers.join(","))
     }
 }
@@ -98,15 +98,15 @@ impl FromStr for Lens {
 
     fn from_str(text: &str) -> Result<Self, String> {
         let (word, rest) = text.split_once(':').unwrap_or((text, ""));
-        let found = LensKind::ALL.iter().find(|(_, name, _)| *name == word);
+        let entry = LensKind::ALL.iter().find(|(_, name, _)| *name == word);
         let fault =
             || format!("{text:?} is not a lens: use fisheye:K1[,K2,K3,K4] or radial:K1[,K2]");
-        let &(kind, _, most) = found.ok_or_else(fault)?;
+        let &(kind, _, max_count) = entry.ok_or_else(fault)?;
         let mut k = [0.0; MAX_COEFFICIENTS];
         let numbers = rest.split(',').filter(|_| !rest.is_empty());
         for (i, number) in numbers.enumerate() {
             let number: f64 = number.trim().parse().map_err(|_| fault())?;
-            if i >= most || !number.is_finite() {
+            if i >= max_count || !number.is_finite() {
                 return Err(fault());
             }
             k[i] = number;

@@ -10,7 +10,7 @@ use glam::{DMat3, DVec3, Vec2, Vec3, Vec4};
 use crate::error::Error;
 use crate::texture::{Texture, TextureRef};
 
-/// The contents of a source.
+/// The contents of a mesh file or built-in scene.
 #[derive(Debug, Clone, Default)]
 pub struct Model {
     /// Name for messages and for `scene.json`.
@@ -38,7 +38,7 @@ pub struct Model {
     pub lights: Vec<Light>,
     /// The source's cameras.
     pub cameras: Vec<FileCamera>,
-    /// Notes for the user from loading.
+    /// Notes for the user about what was ignored or replaced when the source was loaded.
     pub notes: Vec<String>,
 }
 
@@ -81,11 +81,11 @@ pub struct Material {
     pub emissive: Vec3,
     /// Multiplies base colour and alpha (sRGB).
     pub base_texture: Option<TextureRef>,
-    /// Multiplies alpha with its red channel (OBJ's `map_d`).
+    /// Its red channel multiplies alpha (OBJ's `map_d`).
     pub alpha_texture: Option<TextureRef>,
-    /// Green multiplies roughness (linear).
+    /// Its green channel multiplies the roughness (linear).
     pub roughness_texture: Option<TextureRef>,
-    /// Blue multiplies metalness (linear); in glTF it is the same texture as for roughness.
+    /// Its blue channel multiplies the metalness (linear); in glTF it is the same texture as for roughness.
     pub metallic_texture: Option<TextureRef>,
     /// Tangent-space normals (linear).
     pub normal_texture: Option<TextureRef>,
@@ -142,29 +142,29 @@ pub enum LightKind {
         /// Direction of travel.
         direction: DVec3,
     },
-    /// Light from a point; intensity is radiant intensity, falling with the square of distance.
+    /// Light from a point; intensity is radiant intensity, so that irradiance falls with the square of the distance.
     Point {
         /// Position.
         position: DVec3,
     },
-    /// Light from a point into a cone.
+    /// Light from a point into a cone; intensity is as for `Point`.
     Spot {
         /// Position.
         position: DVec3,
         /// Axis of the cone, unit length.
         direction: DVec3,
-        /// Cosine of the angle within which intensity is full.
+        /// Cosine of the angle from the axis within which intensity is full.
         cos_inner: f32,
-        /// Cosine of the angle beyond which intensity is zero.
+        /// Cosine of the angle from the axis beyond which intensity is zero.
         cos_outer: f32,
     },
     /// A rectangle that emits to the side of `u x v`, sampled at random points; intensity is radiance.
     Area {
         /// A corner.
         corner: DVec3,
-        /// One side.
+        /// One side, as a vector from the corner.
         u: DVec3,
-        /// The other side.
+        /// The other side, as a vector from the corner.
         v: DVec3,
     },
 }
@@ -174,7 +174,7 @@ pub enum LightKind {
 pub struct Light {
     /// Shape and position.
     pub kind: LightKind,
-    /// Linear colour times intensity, in the kind's unit.
+    /// Linear colour times intensity, in the unit given by the kind.
     pub intensity: Vec3,
     /// Distance beyond which the light has no effect; may be infinite.
     pub range: f64,
@@ -194,7 +194,7 @@ pub struct FileCamera {
 }
 
 impl Model {
-    /// Appends a triangle mesh whose vertices share one material. Normals may be empty (flat
+    /// Appends a triangle mesh whose triangles share one material. Normals may be empty (flat
     /// shading); UVs may be empty.
     pub fn add(
         &mut self,

@@ -27,7 +27,7 @@ impl Surface {
     }
 
     /// Slot of the triangle, nearest point and distance, in local coordinates. Of several triangles at the same
-    /// distance, the first of the model.
+    /// distance, the first in the model is used.
     #[expect(clippy::float_cmp, reason = "ties are exact: the same triangle twice")]
     fn nearest_local(&self, p: DVec3) -> (u32, DVec3, f64) {
         let nodes = &self.bvh.nodes;
@@ -38,8 +38,8 @@ impl Surface {
         };
         let mut best = (0_u32, DVec3::ZERO, f64::INFINITY);
         let mut open = vec![(0.0_f64, 0_u32)];
-        while let Some((least_squared, index)) = open.pop() {
-            if least_squared > best.2 {
+        while let Some((squared_bound, index)) = open.pop() {
+            if squared_bound > best.2 {
                 continue;
             }
             let node = &nodes[index as usize];

@@ -48,9 +48,9 @@ fn set_lanes(mut lanes: u32) -> impl Iterator<Item = usize> {
 struct PacketBounds {
     /// Axes along which all rays go backward.
     backward: BVec3A,
-    /// For each axis, the origin that reaches the near plane of a box first.
+    /// For each axis, the coordinate of the origin that reaches the near plane of a box first.
     first: Vec3A,
-    /// For each axis, the origin that reaches the far plane of a box last.
+    /// For each axis, the coordinate of the origin that reaches the far plane of a box last.
     last: Vec3A,
     /// Bounds of the reciprocal directions.
     inverse: (Vec3A, Vec3A),
@@ -66,7 +66,7 @@ impl PacketBounds {
             origin = (origin.0.min(o), origin.1.max(o));
             direction = (direction.0.min(d), direction.1.max(d));
         }
-        // The reciprocal of a smaller number overflows.
+        // The reciprocal of a smaller number may overflow.
         let tiny = Vec3A::splat(f32::MIN_POSITIVE);
         let backward = direction.1.cmple(-tiny);
         let is_bounded = backward | direction.0.cmpge(tiny);
@@ -83,7 +83,7 @@ impl PacketBounds {
         }
     }
 
-    /// A lower bound of the parameter at which a ray enters a box; infinite if no ray can hit it.
+    /// A lower bound of the ray parameter at which a ray of the packet enters a box; infinite if none can hit it.
     #[inline(always)]
     fn entry(&self, aabb: &Aabb) -> f32 {
         let near = Vec3A::select(self.backward, aabb.max, aabb.min) - self.first;
@@ -94,20 +94,21 @@ impl PacketBounds {
     }
 }
 
-/// Rays side by side, whose sheared spaces have the same axes.
+/// A packet of rays, stored side by side, whose sheared spaces have the same axes.
 struct RayPacket<'a> {
     rays: &'a [LocalRay],
     sheared: [ShearedRay; LANES],
     /// The coordinate axes that are x, y and z of the sheared spaces.
     axes: [usize; 3],
-    /// Origins along these axes.
+    /// Coordinates of the origins along these axes.
     origin: [[f32; LANES]; 3],
+    /// Shears of x and y along z.
     shear: [[f32; LANES]; 2],
     bounds: PacketBounds,
 }
 
 impl<'a> RayPacket<'a> {
-    /// `None` for a single ray, or if the largest components of the directions differ in axis or sign.
+    /// Prepares a packet; `None` for a single ray, or if the directions' largest components differ in axis or sign.
     fn new(rays: &'a [LocalRay]) -> Option<Self> {
         if !(2..=LANES).contains(&rays.len()) {
             return None;
@@ -156,7 +157,7 @@ impl<'a> RayPacket<'a> {
             let w = b[0][lane] * a[1][lane] - b[1][lane] * a[0][lane];
             let below = (u < 0.0) | (v < 0.0) | (w < 0.0);
             let above = (u > 0.0) | (v > 0.0) | (w > 0.0);
-            // If one is zero, `intersect` evaluates them again in f64.
+            // If one edge function is zero, `intersect` evaluates all three again in f64.
             let exact = (u == 0.0) | (v == 0.0) | (w == 0.0);
             may |= if (below & above) & !exact { 0 } else { BITS[lane] };
         }
@@ -164,7 +165,7 @@ impl<'a> RayPacket<'a> {
     }
 
     /// Visits the triangles that rays may hit, nearer boxes first. `visit` gets the triangle's slot and the rays
-    /// as bits, and returns the largest ray parameter that is still of interest: negative infinity to stop.
+    /// as bits, and returns the largest ray parameter that is still of interest, or negative infinity to stop.
     #[inline]
     fn traverse(&self, surface: &Surface, mut visit: impl FnMut(u32, u32) -> f32) {
         let nodes = &surface.bvh.nodes;
@@ -214,8 +215,8 @@ impl<'a> RayPacket<'a> {
 }
 
 impl Surface {
-    /// True if no ray from `origin` within the pyramid of these directions can hit the surface, as the pyramid
-    /// hits no leaf's box. The pyramid must contain the rays with a margin for rounding in single precision.
+    /// True if the pyramid of these directions from `origin` hits no leaf's box, so that no ray within it can hit the
+    /// surface. The pyramid must contain the rays with a margin for rounding in single precision.
     pub(crate) fn is_missed_by(&self, origin: DVec3, directions: [DVec3; 4]) -> bool {
         let origin = self.local_from_world(origin).as_vec3();
         let bounds = PacketBounds::around(directions.into_iter().map(|d| (origin, d.as_vec3())));
@@ -278,8 +279,8 @@ impl Surface {
         best
     }
 
-    /// Which of at most [`LANES`] rays have an occluder (see [`Surface::occluder`]), as bits. The triangle `hint` is
-    /// tested first, and is set to the last occluder found.
+    /// The rays that have an occluder (see [`Surface::occluder`]), of at most [`LANES`] rays, as bits. The triangle in
+    /// slot `hint` is tested first; `hint` is set to the slot of the last occluder found.
     pub(crate) fn occluded_each(
         &self,
         rays: &[LocalRay],
@@ -288,27 +289,27 @@ impl Surface {
     ) -> u32 {
         let mut hidden = 0;
         // The packet consists of the rays that the hint does not occlude.
-        let mut left = [0_usize; LANES];
+        let mut remaining = [0_usize; LANES];
         let mut count = 0;
         for (lane, ray) in rays.iter().enumerate() {
             if hint.is_some_and(|slot| self.occludes(slot, ray, &accept)) {
                 hidden |= 1 << lane;
             } else {
-                left[count] = lane;
+                remaining[count] = lane;
                 count += 1;
             }
         }
-        let Some(&first) = left[..count].first() else {
+        let Some(&first) = remaining[..count].first() else {
             return hidden;
         };
         let mut others = [rays[first]; LANES];
-        for (other, &lane) in others.iter_mut().zip(&left[..count]) {
+        for (other, &lane) in others.iter_mut().zip(&remaining[..count]) {
             *other = rays[lane];
         }
         let others = &others[..count];
         let packet = if self.depth() <= MAX_DEPTH { RayPacket::new(others) } else { None };
         let Some(packet) = packet else {
-            for (ray, lane) in others.iter().zip(left) {
+            for (ray, lane) in others.iter().zip(remaining) {
                 if let Some(slot) = self.occluder(ray, &accept) {
                     hidden |= 1 << lane;
                     *hint = Some(slot);
@@ -316,19 +317,19 @@ impl Surface {
             }
             return hidden;
         };
-        let mut open = u32::MAX >> (32 - count);
+        let mut unoccluded = u32::MAX >> (32 - count);
         let reach = others.iter().map(|ray| ray.tmax).fold(0.0, f32::max);
         packet.traverse(self, |slot, lanes| {
-            for lane in set_lanes(lanes & open) {
+            for lane in set_lanes(lanes & unoccluded) {
                 let ray = &others[lane];
                 let hit = self.intersect(slot, &packet.sheared[lane], ray.tmin, ray.tmax);
                 if hit.is_some_and(|at| accept(slot, &at)) {
-                    open &= !(1 << lane);
-                    hidden |= 1 << left[lane];
+                    unoccluded &= !(1 << lane);
+                    hidden |= 1 << remaining[lane];
                     *hint = Some(slot);
                 }
             }
-            if open == 0 { f32::NEG_INFINITY } else { reach }
+            if unoccluded == 0 { f32::NEG_INFINITY } else { reach }
         });
         hidden
     }

@@ -15,14 +15,15 @@ const GRID: u32 = 3;
 /// Direction towards the light, in camera axes.
 const LIGHT: DVec3 = DVec3::new(-0.48, -0.64, -0.6);
 
-/// An ellipsoid aligned with the camera's axes.
+/// An ellipsoid aligned with the camera's axes, in camera coordinates.
 struct Part {
     centre: DVec3,
-    half: DVec3,
+    /// Semi-axes.
+    axes: DVec3,
     colour: Vec3,
 }
 
-/// Selects the views with passers-by: a share of all `views`, rounded to a whole number, at random by the seed.
+/// Selects the views with passers-by at random: a share of all `views`, rounded to a whole number.
 pub(crate) fn select_views(seed: u64, views: usize, share: f64) -> Vec<bool> {
     let mut order: Vec<usize> = (0..views).collect();
     order.sort_by_key(|&view| (Draws::new(seed, &[STREAM, view as u64, 1]).bits(), view));
@@ -89,9 +90,9 @@ fn figure(camera: &Camera, depth: f64, draws: &mut Draws) -> [Part; 4] {
         Vec3::new(between(0.02, 0.6) as f32, between(0.02, 0.6) as f32, between(0.02, 0.6) as f32)
     };
     let (coat, trousers) = (colour(), colour());
-    let part = |x: f64, y: f64, half: [f64; 3], colour: Vec3| Part {
+    let part = |x: f64, y: f64, axes: [f64; 3], colour: Vec3| Part {
         centre: centre + height * DVec3::new(x, y, 0.0),
-        half: height * DVec3::from(half),
+        axes: height * DVec3::from(axes),
         colour,
     };
     [
@@ -102,7 +103,7 @@ fn figure(camera: &Camera, depth: f64, draws: &mut Draws) -> [Part; 4] {
     ]
 }
 
-/// The figures in a pixel that are nearer than `scene_depth`: their radiance times their coverage, and the coverage.
+/// Traces the figures that are nearer than `scene_depth` in a pixel: their radiance times coverage, and their coverage.
 fn trace(parts: &[Part], camera: &Camera, corner: DVec2, scene_depth: f64) -> (Vec3, f32) {
     let axes = camera.world_from_camera.transpose();
     let (mut sum, mut hits) = (Vec3::ZERO, 0);
@@ -110,14 +111,14 @@ fn trace(parts: &[Part], camera: &Camera, corner: DVec2, scene_depth: f64) -> (V
         let offset = DVec2::new(f64::from(ray % GRID), f64::from(ray / GRID)) + 0.5;
         let direction = axes * camera.direction(corner + offset / f64::from(GRID));
         let first = parts.iter().filter_map(|part| {
-            let (scaled, centre) = (direction / part.half, part.centre / part.half);
+            let (scaled, centre) = (direction / part.axes, part.centre / part.axes);
             let (a, b) = (scaled.length_squared(), scaled.dot(centre));
             let root = b * b - a * (centre.length_squared() - 1.0);
             let depth = (b - root.max(0.0).sqrt()) / a;
             (root > 0.0 && depth > 0.0 && depth < scene_depth).then_some((depth, part))
         });
         if let Some((depth, part)) = first.min_by(|a, b| a.0.total_cmp(&b.0)) {
-            let normal = ((depth * direction - part.centre) / (part.half * part.half)).normalize();
+            let normal = ((depth * direction - part.centre) / (part.axes * part.axes)).normalize();
             sum += part.colour * (0.35 + 0.65 * normal.dot(LIGHT).max(0.0)) as f32;
             hits += 1;
         }

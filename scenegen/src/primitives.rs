@@ -9,8 +9,8 @@ use crate::random::Draws;
 use crate::texture::{Texture, TextureRef, encode};
 
 impl Model {
-    /// A sphere of `20 · 4^level` triangles, all corners on the sphere, smooth normals. Texture
-    /// coordinates are longitude and latitude of the corners.
+    /// A sphere of `20 · 4^level` triangles with all corners on the sphere and smooth normals. Texture
+    /// coordinates are the longitude and latitude of the corners.
     pub(crate) fn sphere(&mut self, centre: DVec3, radius: f64, level: u32, material: u32) {
         self.ball(level, material, |out| (centre + radius * out, out));
     }
@@ -23,7 +23,7 @@ impl Model {
         shape: impl Fn(DVec3) -> (DVec3, DVec3),
     ) {
         let (corners, triangles) = icosphere(level);
-        // Triangles do not share corners, so that longitude can exceed 1 where it wraps.
+        // Triangles do not share corners, so that texture coordinates can exceed 1 where the longitude wraps.
         let (mut positions, mut normals, mut uvs) = (Vec::new(), Vec::new(), Vec::new());
         for triangle in &triangles {
             let corners = triangle.map(|i| corners[i as usize]);
@@ -167,7 +167,7 @@ pub(crate) fn marbled(at: DVec2, cells: u32, seed: u64, from: [f32; 3], to: [f32
     Vec3::from(from).lerp(Vec3::from(to), share as f32)
 }
 
-/// True on the light fields of a chequered pattern of `count` x `count` fields.
+/// True on the light squares of a chequered pattern of `count` x `count` squares.
 pub(crate) fn chequered(at: DVec2, count: f64) -> bool {
     ((at.x * count).floor() + (at.y * count).floor()).rem_euclid(2.0) < 0.5
 }
@@ -191,7 +191,7 @@ pub(crate) fn icosphere(level: u32) -> (Vec<DVec3>, Vec<[u32; 3]>) {
             corners.push(DVec3::from(corner).normalize());
         }
     }
-    // Triangles are the triples of corners that are pairwise an edge apart, the shortest distance of corners.
+    // Triangles are the triples of corners that are pairwise one edge apart: the shortest distance between corners.
     let edge = 2.0 / (1.0 + g * g).sqrt() + 1e-9;
     let near = |i: usize, j: usize| corners[i].distance(corners[j]) < edge;
     let mut triangles = Vec::new();

@@ -18,7 +18,7 @@ use crate::texture::Texture;
 
 /// Largest file read `[bytes]`.
 const MAX_FILE: u64 = 16 << 30;
-/// Formats of textures.
+/// Supported formats of textures.
 const FORMATS: [ImageFormat; 3] = [ImageFormat::Png, ImageFormat::Jpeg, ImageFormat::WebP];
 /// Largest side of an image `[px]`.
 const MAX_SIDE: u32 = 16_384;
@@ -26,23 +26,23 @@ const MAX_SIDE: u32 = 16_384;
 const MAX_PIXELS: u64 = 1 << 28;
 /// Maximum memory of a decoder `[bytes]`.
 pub(crate) const MAX_DECODED: u64 = 1 << 30;
-/// Maximum number of bytes that one byte of a compressed file can expand to: deflate's limit, 1032, and a
-/// margin.
+/// Maximum number of bytes that one byte of a compressed file can expand to: deflate's limit of 1032 plus
+/// a margin.
 pub(crate) const EXPANSION: u64 = 1100;
 /// Maximum number of texels of all textures of a model.
 const MAX_TEXELS: u64 = 1 << 29;
 /// Longest reference to a file `[bytes]`.
 const MAX_NAME: usize = 4096;
 
-/// Opens a file for reading. Pipes, sockets and devices are refused at once instead of waiting for them.
+/// Opens a file for reading. Pipes, sockets and devices are refused without waiting for their data.
 pub(crate) fn open(path: &Path) -> Result<File, Error> {
     let mut options = OpenOptions::new();
     options.read(true);
     #[cfg(unix)]
     std::os::unix::fs::OpenOptionsExt::custom_flags(&mut options, libc::O_NONBLOCK);
     let file = options.open(path).map_err(Error::io(path))?;
-    let known = file.metadata().map_err(Error::io(path))?;
-    if !known.is_file() && !known.is_dir() {
+    let metadata = file.metadata().map_err(Error::io(path))?;
+    if !metadata.is_file() && !metadata.is_dir() {
         let problem = "it is a pipe, a socket or a device, not a file";
         return Err(Error::malformed(path, "the file", problem, "replace it with a regular file"));
     }
@@ -52,16 +52,16 @@ pub(crate) fn open(path: &Path) -> Result<File, Error> {
 /// Reads a whole file.
 pub(crate) fn read(path: &Path) -> Result<Vec<u8>, Error> {
     let file = open(path)?;
-    let known = file.metadata().map_err(Error::io(path))?;
+    let metadata = file.metadata().map_err(Error::io(path))?;
     let too_large =
         || Error::malformed(path, "the file", "it is larger than 16 GiB", "split the mesh");
-    if known.len() > MAX_FILE {
+    if metadata.len() > MAX_FILE {
         return Err(too_large());
     }
     let mut bytes = Vec::new();
-    // A growing buffer could end at twice the size.
+    // A growing buffer could end up with twice the capacity.
     bytes
-        .try_reserve_exact(known.len() as usize + 1)
+        .try_reserve_exact(metadata.len() as usize + 1)
         .map_err(|_| Error::io(path)(std::io::ErrorKind::OutOfMemory.into()))?;
     file.take(MAX_FILE + 1).read_to_end(&mut bytes).map_err(Error::io(path))?;
     if bytes.len() as u64 > MAX_FILE { Err(too_large()) } else { Ok(bytes) }
@@ -75,20 +75,21 @@ pub(crate) struct Folder {
 }
 
 impl Folder {
-    pub(crate) fn around(file: &Path) -> Result<Self, Error> {
+    /// The folder that contains a mesh file.
+    pub(crate) fn containing(file: &Path) -> Result<Self, Error> {
         let folder = folder_of(file);
         let folder = folder.canonicalize().map_err(Error::io(folder))?;
         Ok(Self { file: file.to_owned(), folder })
     }
 
-    /// The path of a reference; the file need not exist.
+    /// The path of the file that `reference` names; the file need not exist.
     pub(crate) fn resolve(&self, element: &str, reference: &str) -> Result<PathBuf, Error> {
         let refuse = |problem| Err(self.refused(element, reference, problem));
         if reference.is_empty() || reference.len() > MAX_NAME {
             return refuse("is empty or longer than 4 KiB");
         }
         if reference.contains('\0') {
-            return refuse("contains a NUL");
+            return refuse("contains a NUL character");
         }
         // A colon before the first slash marks a scheme or a drive.
         if reference.split(['/', '\\']).next().is_some_and(|first| first.contains(':')) {
@@ -166,7 +167,7 @@ pub(crate) fn add_texture(
     Ok(model.textures.len() as u32 - 1)
 }
 
-/// Shortens text of a file for a message.
+/// Shortens text from a file for a message.
 pub(crate) fn shortened(text: &str) -> String {
     text.chars().take(80).collect()
 }
@@ -215,7 +216,7 @@ pub(crate) fn folder_of(file: &Path) -> &Path {
     }
 }
 
-/// A decoder with limits for one of these formats; `problem` is the error for other formats.
+/// A decoder for images of these formats, with limits; `problem` is the error for images of other formats.
 pub(crate) fn image_reader<'a>(
     bytes: &'a [u8],
     formats: &[ImageFormat],
@@ -261,7 +262,7 @@ mod tests {
         let folder = tempfile::tempdir().expect("folder");
         let file = folder.path().join("a.gltf");
         std::fs::write(&file, "x").expect("write");
-        let here = Folder::around(&file).expect("folder");
+        let here = Folder::containing(&file).expect("folder");
         for bad in [
             "../b.bin",
             "a/../../b",

@@ -1,6 +1,6 @@
 //! Prepares a scene from a source and options, so that its views can be rendered.
 //!
-//! The file exceeds 400 lines because geometry, cameras, light and exposure each depend on the ones before.
+//! The file exceeds 400 lines because geometry, cameras, light and exposure each depend on those before.
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -32,14 +32,14 @@ pub enum Source {
     File(PathBuf),
 }
 
-/// Rendering options. `None`: the preset's value if it has one, otherwise the default.
+/// Rendering options. A field that is `None` takes the preset's value if there is one, otherwise the default.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Options {
     /// Arrangement of the cameras.
     pub rig: Option<RigKind>,
-    /// Views to train on.
+    /// Number of training views.
     pub train: Option<u32>,
-    /// Views held out.
+    /// Number of test views, which are held out.
     pub test: Option<u32>,
     /// Image width and height `[px]`.
     pub size: Option<(u32, u32)>,
@@ -51,7 +51,7 @@ pub struct Options {
     pub jitter: Option<f64>,
     /// Subsamples along each side of a pixel; 4 means 16 samples.
     pub grid: u32,
-    /// Light from the sky and from other surfaces.
+    /// How light from the sky and from other surfaces is computed.
     pub ambient: Option<Ambient>,
     /// An equirectangular `.hdr` or `.exr` image as the sky, in place of the built-in sky and sun.
     pub sky: Option<PathBuf>,
@@ -68,12 +68,12 @@ pub struct Options {
     /// Lens of training views; test views are always pinhole images.
     #[serde(default)]
     pub lens: Option<Lens>,
-    /// Share of training views with (masked) people walking through.
+    /// Share of training views with people walking through the scene, who are masked; 0 to 1.
     #[serde(default)]
     pub passers_by: f64,
-    /// Initial points.
+    /// Number and errors of the initial points.
     pub points: PointOptions,
-    /// Seed of everything random.
+    /// Seed of all random numbers.
     pub seed: u64,
 }
 
@@ -109,12 +109,12 @@ const MAX_JITTER: f32 = 8.0;
 /// Key of the random stream of exposures.
 const EXPOSURES: u64 = 0x0065_7870_6f73_6564;
 
-/// A view's part in training.
+/// The set that a view belongs to.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Split {
-    /// Trained on.
+    /// Views to train on.
     Train,
-    /// Held out.
+    /// Views held out for evaluation.
     Test,
 }
 
@@ -152,7 +152,7 @@ pub struct Scene {
     train_cameras: Vec<Camera>,
     lighting: Lighting,
     flags: Vec<TriangleFlags>,
-    /// True for views with people walking through. Shape: `[training views]`.
+    /// True for views with passers-by. Shape: `[training views]`.
     has_passers: Vec<bool>,
 }
 
@@ -169,7 +169,7 @@ pub struct Generated {
 /// Renders all views of a scene into memory.
 ///
 /// # Errors
-/// As [`Scene::prepare`].
+/// Those of [`Scene::prepare`].
 pub fn generate(source: &Source, options: &Options) -> Result<Generated, Error> {
     let scene = Scene::prepare(source, options)?;
     let mut collector = scene.point_collector();
@@ -220,7 +220,7 @@ impl Scene {
         } else if is_file && !has_own_lights {
             model.lights.push(sun());
         }
-        let light = |sky, grid| {
+        let build = |sky, grid| {
             Lighting::new(&model.lights, &surface, sky, (ambient, options.shadows, grid))
         };
         let mut exposure = options.exposure.unwrap_or(1.0);
@@ -228,7 +228,7 @@ impl Scene {
         if has_own_lights || options.sky.is_some() {
             let sky_is_fill = options.sky.is_none();
             if options.exposure.is_none() {
-                let unfilled = light(if sky_is_fill { Sky::uniform(0.0) } else { sky.clone() }, 1);
+                let unfilled = build(if sky_is_fill { Sky::uniform(0.0) } else { sky.clone() }, 1);
                 let (surface, model, flags) = (&surface, &model, &flags);
                 let tracer =
                     Tracer { surface, model, flags, lighting: &unfilled, exposure: 1.0, seed: 0 };
@@ -239,7 +239,7 @@ impl Scene {
                 sky = sky.dimmed(0.4 / exposure);
             }
         }
-        let lighting = light(sky.clone(), options.grid);
+        let lighting = build(sky.clone(), options.grid);
         let name_of = |split: &str, i: usize| format!("{split}/r_{i:03}");
         let views = |cameras: &[Camera], split: Split, folder: &str| {
             let view =
@@ -267,7 +267,7 @@ impl Scene {
         Ok(scene)
     }
 
-    /// An error if no view shows a surface.
+    /// Returns an error if no view shows a surface.
     fn check_visible(&self) -> Result<(), Error> {
         let tracer = self.tracer();
         let cameras = || self.views.iter().map(|view| &view.camera);
@@ -280,8 +280,8 @@ impl Scene {
             return Ok(());
         }
         Err(Error::Input(format!(
-            "{}: none of the {} views shows a surface: the cameras look past it or at the backs of one-sided faces, or its \
-             materials are transparent; choose another --rig or --radius, or correct the materials",
+            "{}: none of the {} views shows a surface: the cameras look past the mesh or at the backs of one-sided \
+             faces, or its materials are transparent; choose another --rig or --radius, or correct the materials",
             self.name,
             self.views.len()
         )))
@@ -310,7 +310,7 @@ impl Scene {
         Some([gain * red, gain, gain * blue])
     }
 
-    /// A collector of initial points, which is given training views as they are rendered.
+    /// A collector of initial points, which must be given the training views as they are rendered.
     pub fn point_collector(&self) -> PointCollector<'_> {
         PointCollector::new(self.tracer(), &self.train_cameras, self.options.points)
     }
@@ -330,7 +330,7 @@ impl Scene {
 fn check(options: &Options) -> Result<(), Error> {
     let share = |option, value: f64| match value {
         0.0..=1.0 => Ok(()),
-        _ => Err(Error::option(option, format!("{value} is not in 0 to 1"))),
+        _ => Err(Error::option(option, format!("{value} is not between 0 and 1"))),
     };
     share("--point-noise", options.points.noise)?;
     share("--outliers", options.points.outliers)?;
@@ -339,7 +339,7 @@ fn check(options: &Options) -> Result<(), Error> {
     if !(1..=64).contains(&options.grid) {
         return Err(Error::option(
             "--samples",
-            format!("{} per side is not in 1 to 64", options.grid),
+            format!("{} per side is not between 1 and 64", options.grid),
         ));
     }
     if options.points.count > 1 << 28 {
@@ -347,11 +347,11 @@ fn check(options: &Options) -> Result<(), Error> {
     }
     if !(0.0..=MAX_JITTER).contains(&options.exposure_jitter) {
         let stops = options.exposure_jitter;
-        let problem = format!("{stops} stops are not in 0 to {MAX_JITTER}");
+        let problem = format!("{stops} is not between 0 and {MAX_JITTER} stops");
         return Err(Error::option("--exposure-jitter", problem));
     }
     if options.exposure.is_some_and(|e| !(e > 0.0 && e.is_finite())) {
-        return Err(Error::option("--exposure", "it must be positive"));
+        return Err(Error::option("--exposure", "it must be positive and finite"));
     }
     Ok(())
 }
@@ -426,7 +426,7 @@ fn with_options(rig: Rig, options: &Options) -> Rig {
     }
 }
 
-/// The exposure at which the 98th percentile of luminance is 0.9.
+/// The exposure that brings the 98th percentile of luminance to 0.9.
 fn exposure_for(tracer: &Tracer<'_>, cameras: &[Camera]) -> f32 {
     let step = cameras.len().div_ceil(6).max(1);
     let mut all = Vec::new();

@@ -23,10 +23,10 @@ const MIN_ALPHA: f32 = 1e-3;
 /// Distance above the surface at which secondary rays start, and in front of a light at which they end: 20 ulps
 /// of local coordinates, as the hit point is rounded in each coordinate and along the ray.
 const LIFT: f32 = 2.5e-3;
-/// Normal reflectance of a dielectric.
+/// Reflectance of a dielectric at normal incidence.
 const DIELECTRIC: f32 = 0.04;
 
-/// Light from the sky and from other surfaces.
+/// The method of computing the light from the sky and from other surfaces.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Ambient {
@@ -34,13 +34,13 @@ pub enum Ambient {
     Open,
     /// Occlusion of the sky is sampled with this number of rays per pixel.
     Occlusion(u32),
-    /// As `Occlusion`, and the occluding surfaces reflect their direct light (one bounce).
+    /// As `Occlusion`, but the occluding surfaces reflect the light that falls on them directly (one bounce).
     Bounce(u32),
 }
 
 /// The light of a scene.
 pub(crate) struct Lighting {
-    /// In local coordinates.
+    /// The lights, in local coordinates.
     lights: Vec<Light>,
     pub(crate) sky: Sky,
     pub(crate) ambient: Ambient,
@@ -78,7 +78,7 @@ pub(crate) struct VisiblePoint<'a> {
     /// Index of the subsample.
     pub(crate) index: u32,
     pub(crate) point: Point<'a>,
-    /// Towards the viewer.
+    /// Direction towards the viewer, unit length.
     pub(crate) view: Vec3,
 }
 
@@ -178,6 +178,7 @@ impl Lighting {
         shaded.surface.occluded_each(rays, &mut sampling.occluder_hint, solid)
     }
 
+    /// Radiance of the light from the sky and from other surfaces that a point reflects.
     fn ambient(
         &self,
         shaded: &ShadedSurface<'_>,
@@ -216,7 +217,8 @@ impl Lighting {
         diffuse + self.specular_bounce(shaded, seen, sampling)
     }
 
-    /// Radiance from a direction: that of the sky, or of the directly lit surface in front of it.
+    /// Radiance from a direction: that of the sky or, with `bounce`, of the directly lit surface in front of it.
+    /// Without `bounce`, surfaces are black.
     fn incoming(
         &self,
         shaded: &ShadedSurface<'_>,
@@ -234,24 +236,24 @@ impl Lighting {
         let Some(hit) = shaded.surface.closest(&ray, None, None, solid) else {
             return self.sky.radiance(direction);
         };
-        let (there, _) = Point::read(shaded, &ray, &hit, 0.0);
-        if there.is_unlit() {
-            return there.base;
+        let (lit, _) = Point::read(shaded, &ray, &hit, 0.0);
+        if lit.is_unlit() {
+            return lit.base;
         }
-        let emitted = if there.material.is_light { Vec3::ZERO } else { there.emitted };
-        let mut total = emitted + there.diffuse_colour() * self.sky.irradiance(there.shading) / PI;
+        let emitted = if lit.material.is_light { Vec3::ZERO } else { lit.emitted };
+        let mut total = emitted + lit.diffuse_colour() * self.sky.irradiance(lit.shading) / PI;
         for light in &self.lights {
             let u = || sampling.draws.square();
-            let Some((to_light, distance, irradiance)) = incident_light(light, there.position, u)
+            let Some((to_light, distance, irradiance)) = incident_light(light, lit.position, u)
             else {
                 continue;
             };
-            let cos = there.shading.dot(to_light);
+            let cos = lit.shading.dot(to_light);
             if cos > 0.0
-                && there.geometric.dot(to_light) > 0.0
-                && self.occluded(shaded, &[shadow_ray(&there, to_light, distance)], sampling) == 0
+                && lit.geometric.dot(to_light) > 0.0
+                && self.occluded(shaded, &[shadow_ray(&lit, to_light, distance)], sampling) == 0
             {
-                total += there.diffuse_colour() / PI * cos * irradiance;
+                total += lit.diffuse_colour() / PI * cos * irradiance;
             }
         }
         total
@@ -387,9 +389,9 @@ pub(crate) struct ShadedSurface<'a> {
 /// Properties of a triangle that decide whether a ray hits it.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub(crate) struct TriangleFlags {
-    /// The back is invisible.
+    /// True if the back is invisible.
     pub(crate) one_sided: bool,
-    /// Alpha may be below one.
+    /// True if alpha may be below one.
     pub(crate) see_through: bool,
 }
 
@@ -520,7 +522,7 @@ impl TrianglePoint<'_> {
         (bump.x * tangent + bump.y * bitangent + bump.z * normal).normalize_or(normal)
     }
 
-    /// The direction of increasing u, and the handedness, 1 or −1.
+    /// The direction of increasing u, and the handedness, 1 or −1; `None` if texture coordinates do not define them.
     fn tangent_of_uvs(&self, texture: &TextureRef) -> Option<(Vec3, f32)> {
         let uvs = &self.model.uvs[texture.uv_set.min(1)];
         let [ta, tb, tc] = self.indices.map(|i| uvs.get(i).map(|&uv| texture.transformed(uv)));
@@ -605,9 +607,9 @@ fn fresnel(f0: Vec3, cos: f32) -> Vec3 {
 /// Number of steps of the table of directional albedo along each axis.
 const STEPS: usize = 16;
 
-/// The directional albedo of GGX as a factor (scale) on the normal reflectance and an offset (bias) (Karis,
-/// "Real Shading in Unreal Engine 4", 2013). Interpolated in a table that is computed once by sampling visible
-/// normals.
+/// The directional albedo of GGX as a factor (scale) on the reflectance at normal incidence and an offset (bias)
+/// (Karis, "Real Shading in Unreal Engine 4", 2013). It is interpolated in a table that is computed once by sampling
+/// visible normals.
 fn directional_albedo(cos: f32, roughness: f32) -> (f32, f32) {
     static TABLE: OnceLock<Vec<(f32, f32)>> = OnceLock::new();
     let table = TABLE.get_or_init(|| {
@@ -659,7 +661,7 @@ fn visibility(cos_view: f32, cos_light: f32, alpha: f32) -> f32 {
     0.5 / (v + l)
 }
 
-/// G2 / G1: the weight of a direction sampled by a visible normal.
+/// G2 / G1: the weight of a direction that was sampled by reflection at a visible normal.
 pub(crate) fn shadowing_after_masking(cos_view: f32, cos_out: f32, alpha: f32) -> f32 {
     let a2 = alpha * alpha;
     let lambda = |c: f32| 0.5 * ((1.0 + a2 * (1.0 / (c * c) - 1.0).max(0.0)).sqrt() - 1.0);

@@ -25,11 +25,11 @@ pub enum Sky {
         up: [f32; 3],
     },
     /// An image.
-    Image(#[serde(serialize_with = "shared")] Arc<Panorama>),
+    Image(#[serde(serialize_with = "serialize_shared")] Arc<Panorama>),
 }
 
 /// Serializes a shared panorama.
-fn shared<S: Serializer>(image: &Panorama, to: S) -> Result<S::Ok, S::Error> {
+fn serialize_shared<S: Serializer>(image: &Panorama, to: S) -> Result<S::Ok, S::Error> {
     image.serialize(to)
 }
 

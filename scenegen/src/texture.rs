@@ -10,7 +10,7 @@ use glam::{Vec2, Vec4};
 /// The continuation of a texture beyond the unit square of its coordinates.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Wrap {
-    /// The texels of the edge.
+    /// The texels of the edge, continued.
     Clamp,
     /// The image repeated.
     Repeat,
@@ -51,7 +51,7 @@ pub struct TextureRef {
 }
 
 impl TextureRef {
-    /// A texture with the first set of coordinates, repeated and filtered.
+    /// A reference to a texture that uses the first set of coordinates, repeats the image and filters it.
     pub fn new(texture: u32) -> Self {
         let transform = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]];
         Self { texture, uv_set: 0, sampler: Sampler::default(), transform }
@@ -62,7 +62,7 @@ impl TextureRef {
         Vec2::new(row(self.transform[0]), row(self.transform[1]))
     }
 
-    /// The factor of the transform on areas.
+    /// The factor by which the transform scales areas.
     pub(crate) fn area_scale(&self) -> f32 {
         let [[a, b, _], [c, d, _]] = self.transform;
         (a * d - b * c).abs()
@@ -110,7 +110,7 @@ impl Texture {
     /// left corner.
     pub fn sample(&self, uv: Vec2, sampler: &Sampler, footprint: f32) -> Vec4 {
         let uv = Vec2::new(wrapped(uv.x, sampler.wrap_u), wrapped(uv.y, sampler.wrap_v));
-        let values = Values::tables(self.srgb);
+        let tables = LinearTables::new(self.srgb);
         let first = &self.levels[0];
         let texels = footprint * ((first.width * first.height) as f32).sqrt();
         let level = if sampler.mipmaps { texels.log2() } else { 0.0 };
@@ -118,50 +118,50 @@ impl Texture {
         if level.is_nan() || level <= 0.0 {
             let nearest = sampler.nearest;
             return if nearest {
-                first.nearest(uv, values)
+                first.nearest(uv, tables)
             } else {
-                first.linear(uv, sampler, values)
+                first.linear(uv, sampler, tables)
             };
         }
         let last = self.levels.len() - 1;
         let level = level.min(last as f32);
         let lower = level as usize;
         let share = level - lower as f32;
-        let a = self.levels[lower].linear(uv, sampler, values);
+        let a = self.levels[lower].linear(uv, sampler, tables);
         if share == 0.0 || lower == last {
             return a;
         }
-        a.lerp(self.levels[lower + 1].linear(uv, sampler, values), share)
+        a.lerp(self.levels[lower + 1].linear(uv, sampler, tables), share)
     }
 }
 
 impl Level {
     #[inline]
-    fn texel(&self, x: u32, y: u32, Values { colour, alpha }: Values) -> Vec4 {
+    fn texel(&self, x: u32, y: u32, LinearTables { colour, alpha }: LinearTables) -> Vec4 {
         let at = 4 * (y as usize * self.width as usize + x as usize);
         let [r, g, b, a] = [0, 1, 2, 3].map(|i| usize::from(self.texels[at + i]));
         Vec4::new(colour[r], colour[g], colour[b], alpha[a])
     }
 
-    fn nearest(&self, uv: Vec2, values: Values) -> Vec4 {
+    fn nearest(&self, uv: Vec2, tables: LinearTables) -> Vec4 {
         let x = ((uv.x * self.width as f32) as u32).min(self.width - 1);
         let y = ((uv.y * self.height as f32) as u32).min(self.height - 1);
-        self.texel(x, y, values)
+        self.texel(x, y, tables)
     }
 
     #[inline]
-    fn linear(&self, uv: Vec2, sampler: &Sampler, values: Values) -> Vec4 {
+    fn linear(&self, uv: Vec2, sampler: &Sampler, tables: LinearTables) -> Vec4 {
         let (x0, x1, fx) = neighbours(uv.x, self.width, sampler.wrap_u);
         let (y0, y1, fy) = neighbours(uv.y, self.height, sampler.wrap_v);
-        let upper = self.texel(x0, y0, values).lerp(self.texel(x1, y0, values), fx);
-        let lower = self.texel(x0, y1, values).lerp(self.texel(x1, y1, values), fx);
+        let upper = self.texel(x0, y0, tables).lerp(self.texel(x1, y0, tables), fx);
+        let lower = self.texel(x0, y1, tables).lerp(self.texel(x1, y1, tables), fx);
         upper.lerp(lower, fy)
     }
 
     /// The image at half its size, averaged in linear light.
     fn halved(&self, srgb: bool) -> Self {
         let (width, height) = ((self.width / 2).max(1), (self.height / 2).max(1));
-        let values = Values::tables(srgb);
+        let tables = LinearTables::new(srgb);
         let mut texels = Vec::with_capacity(4 * width as usize * height as usize);
         for y in 0..height {
             for x in 0..width {
@@ -171,7 +171,7 @@ impl Level {
                 let mut sum = Vec4::ZERO;
                 for v in y0..y1 {
                     for u in x0..x1 {
-                        sum += self.texel(u, v, values);
+                        sum += self.texel(u, v, tables);
                     }
                 }
                 let mean = sum / ((x1 - x0) * (y1 - y0)) as f32;
@@ -183,13 +183,13 @@ impl Level {
     }
 }
 
-/// The `i`-th of `count` parts of `0..total`.
+/// The `i`-th of `count` nearly equal parts of `0..total`: start and end.
 fn range(i: u32, count: u32, total: u32) -> (u32, u32) {
     let (i, count, total) = (u64::from(i), u64::from(count), u64::from(total));
     ((i * total / count) as u32, ((i + 1) * total / count) as u32)
 }
 
-/// Maps a coordinate into `[0, 1]` by the wrap mode. NaN becomes 0.
+/// Maps a coordinate into `[0, 1]` by the wrap mode. A non-finite coordinate becomes 0.
 fn wrapped(x: f32, wrap: Wrap) -> f32 {
     let x = if x.is_finite() { x } else { 0.0 };
     match wrap {
@@ -207,7 +207,7 @@ fn neighbours(u: f32, size: u32, wrap: Wrap) -> (u32, u32, f32) {
     let x = u * size as f32 - 0.5;
     let first = if x < 0.0 { -1 } else { x as i64 };
     let last = i64::from(size) - 1;
-    // At most one of the two is beyond an edge, by one texel; its mirror image is the texel at the edge.
+    // At most one of the two texels lies beyond an edge, by one; its mirror image is the texel at the edge.
     let at = |i: i64, repeated: i64| match wrap {
         _ if (0..=last).contains(&i) => i as u32,
         Wrap::Repeat => repeated as u32,
@@ -232,13 +232,13 @@ pub fn srgb_from_linear(v: f64) -> f64 {
 
 /// Tables from a texel's bytes to linear colour and alpha.
 #[derive(Debug, Clone, Copy)]
-struct Values {
+struct LinearTables {
     colour: &'static [f32; 256],
     alpha: &'static [f32; 256],
 }
 
-impl Values {
-    fn tables(srgb: bool) -> Self {
+impl LinearTables {
+    fn new(srgb: bool) -> Self {
         static TABLES: OnceLock<[[f32; 256]; 2]> = OnceLock::new();
         let [plain, decoded] = TABLES.get_or_init(|| {
             let decoded = |i: usize| linear_from_srgb(i as f64 / 255.0) as f32;

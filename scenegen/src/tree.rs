@@ -1,4 +1,4 @@
-//! Builds the tree over a mesh's triangles in parts, as the builder of the library (obvhs) needs three times the
+//! Builds the bounding volume hierarchy of a mesh in parts, as the builder of the library (obvhs) needs three times the
 //! memory of its result.
 //!
 //! The triangles are repeatedly split in halves at the median along the widest axis. The trees of the parts are
@@ -13,7 +13,7 @@ use obvhs::ploc::{PlocBuilder, PlocSearchDistance, SortPrecision};
 
 /// Maximum number of triangles of a part. The builder takes about 200 bytes for each.
 const PART: usize = 1 << 16;
-/// Share of the nodes, those with the largest boxes, that the last optimisation tries to move.
+/// Share of the nodes that the last optimisation tries to move: those with the largest boxes.
 const IMPROVED: f32 = 0.1;
 
 /// Builds the tree over `count` triangles with boxes `box_of`. Leaves hold up to eight triangles;
@@ -69,7 +69,7 @@ fn build_below(
 
 /// Adds the tree of a part to the whole tree, with its root at `place`.
 fn graft(tree: &mut Bvh2, place: usize, part: &Bvh2, ids: &[u32]) {
-    // The part's root takes the existing node `place`; its other nodes i move to i + nodes.
+    // The part's root replaces the existing node `place`; each other node i is appended as node i + `nodes`.
     let (nodes, primitives) = (tree.nodes.len() - 1, tree.primitive_indices.len());
     let mut moved = part.nodes.iter().map(|node| {
         let shift = if node.is_leaf() { primitives } else { nodes };
@@ -84,9 +84,9 @@ fn graft(tree: &mut Bvh2, place: usize, part: &Bvh2, ids: &[u32]) {
     tree.max_depth = tree.max_depth.max(part.max_depth);
 }
 
-/// The library's medium preset without its last optimisation. Its steps are called one by one, as the library's
-/// own function validates in debug builds and panics for degenerate trees of hostile meshes. Triangles are
-/// numbered by their indices in `ids`.
+/// Builds the tree of a part like the library's medium preset, but without its last optimisation. The steps are called
+/// one by one, as the library's own function validates the tree in debug builds and panics if a hostile mesh makes it
+/// degenerate. Triangles are numbered by their indices in `ids`.
 fn build_part(ids: &[u32], box_of: &impl Fn(u32) -> Aabb) -> Bvh2 {
     let boxes: Vec<Aabb> = ids.iter().map(|&id| box_of(id)).collect();
     let mut part = PlocBuilder::with_capacity(boxes.len()).build(

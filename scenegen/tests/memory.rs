@@ -8,7 +8,7 @@ use densify_scenegen::{Options, PointOptions, Scene, Source, write};
 use process::status;
 
 const SIDE: u32 = 256;
-/// Colour, depth, normal and triangle.
+/// Memory of a pixel: colour, depth, normal and triangle.
 const PIXEL_BYTES: u64 = 4 + 4 + 12 + 4;
 
 fn write_views(train: u32) {
@@ -36,7 +36,7 @@ fn peak_memory_does_not_depend_on_the_number_of_views() {
     write_views(60);
     let many = status("VmHWM:").expect("a peak");
     let image = u64::from(SIDE * SIDE) * PIXEL_BYTES;
-    // Holding the views would take sixty images; four allow for variations of the allocator.
+    // Holding the views would take the memory of sixty images; four allow for variations of the allocator.
     assert!(
         many - few < 4 * image,
         "{} more images at the peak",

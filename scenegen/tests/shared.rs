@@ -83,7 +83,7 @@ fn shared_meshes_that_need_other_software_are_refused_by_name() {
     }
 }
 
-/// All files of one list must give the same images.
+/// All files in a list must give the same images.
 #[test]
 #[ignore = "needs the shared cases: set DENSIFY_SHARED"]
 fn shared_cases_of_equal_meaning_give_the_same_images() {
@@ -118,7 +118,7 @@ const EMPTY: &str = "no triangle to render";
 /// files, which have no scene, are empty when read unchanged.
 const OUTCOMES: &str = include_str!("malformed.tsv");
 
-/// The rows of [`OUTCOMES`] for files that are read in this way: file and outcome.
+/// The rows of [`OUTCOMES`] for one of the two readings, `read`: file and outcome.
 fn outcomes(read: &str) -> Vec<(&'static str, &'static str)> {
     let rows = OUTCOMES.lines().filter_map(|line| line.split_once('\t'));
     rows.filter(|(kind, _)| *kind == read).filter_map(|(_, row)| row.split_once('\t')).collect()
@@ -128,7 +128,7 @@ fn outcomes(read: &str) -> Vec<(&'static str, &'static str)> {
 /// malformed or incomplete.
 fn with_a_scene(path: &Path) -> Option<Vec<u8>> {
     let mut root: Value = serde_json::from_slice(&fs::read(path).ok()?).ok()?;
-    let count = |root: &Value, what| root.get(what).and_then(Value::as_array).map_or(0, Vec::len);
+    let count = |root: &Value, list| root.get(list).and_then(Value::as_array).map_or(0, Vec::len);
     if count(&root, "accessors") == 0 {
         let all: Vec<Value> = (0..count(&root, "bufferViews"))
             .map(
@@ -169,8 +169,8 @@ fn with_a_scene(path: &Path) -> Option<Vec<u8>> {
     Some(bytes)
 }
 
-/// Adds a complaint if the outcome is not that of the file's row, or `others` if the file has no row. Each row is
-/// used once.
+/// Adds a complaint if the outcome is not that of the file's row or, without a row, `others`. Removes the row, so that
+/// each is used once.
 fn check_outcome(
     rows: &mut Vec<(&str, &str)>,
     others: &str,

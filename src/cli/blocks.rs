@@ -69,11 +69,11 @@ struct PlanArgs {
     /// least 1,000]`
     #[arg(long, value_name = "N")]
     coarse_rows: Option<Rows>,
-    /// Width of the margin around its cell that a block also trains, as a share of the usual width of a cell
+    /// Width of the margin around its cell in which a block also trains, as a share of the usual width of a cell
     #[arg(long, value_name = "FRACTION", default_value = "0.1")]
     margin: Fraction,
     /// Options of `densify train` for every run, after `--`; --iterations is the length of one run over the whole
-    /// scene, of which each block trains a part in proportion to its share of the views
+    /// scene: each block trains for a part of it, in proportion to the block's share of the views
     #[arg(last = true, value_name = "TRAIN OPTIONS")]
     train: Vec<String>,
 }
@@ -95,10 +95,10 @@ struct SubmitArgs {
     #[arg(long, value_name = "ENGINE", default_value = "local")]
     engine: Engine,
     #[command(flatten)]
-    more: SubmissionArgs,
+    options: SubmissionArgs,
 }
 
-/// Runs one task of a plan, or resumes it. Schedulers call this.
+/// Runs one task of a plan, or resumes it. Schedulers call this command.
 #[derive(Debug, Args)]
 struct RunArgs {
     /// Folder of the plan
@@ -107,7 +107,7 @@ struct RunArgs {
     /// coarse, the name of a block, or merge
     #[arg(value_name = "TASK")]
     task: String,
-    /// Processor threads, in place of the plan's; the result does not depend on it
+    /// Processor threads, in place of the number in the plan; the result does not depend on it
     #[arg(long, value_name = "N")]
     threads: Option<Threads>,
 }
@@ -214,7 +214,7 @@ fn format_table(blocks: &BlockPlan) -> String {
 }
 
 fn run_submit(args: &SubmitArgs, console: &Console) -> Result<(), Failure> {
-    let submission = args.more.for_engine(args.engine)?;
+    let submission = args.options.for_engine(args.engine)?;
     let blocks = BlockPlan::read(&args.folder)?;
     let follower = Follower::new(console);
     follower.listen();

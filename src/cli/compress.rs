@@ -20,7 +20,7 @@ use densify_run::{RunConfig, Whole};
 ///
 /// Prunes the Gaussians that contribute least to the training views, at most half of them at once, and trains the rest
 /// in between. For a file size it tries the model's SH degree and lower ones, and coarser colour where the format has
-/// it: these leave room for more Gaussians. It keeps the attempt whose file reproduces the training views best.
+/// it, because both leave room for more Gaussians. It keeps the attempt whose file reproduces the training views best.
 /// Held-out views are measured, too, but do not affect the choice. The printed table shows quality against size: of
 /// the whole model, of the file after each intermediate pruning, and of the attempts at the final size.
 #[derive(Debug, Args)]
@@ -51,7 +51,7 @@ pub(super) struct CompressArgs {
     /// Saved iteration of the run `[default: the last]`
     #[arg(long, value_name = "N")]
     iteration: Option<u32>,
-    /// Folder or ZIP archive of the dataset: needed for a file, and for a run whose dataset has moved
+    /// Folder or ZIP archive of the dataset: needed for a model file, and for a run whose dataset has moved
     #[arg(long, value_name = "DIR")]
     scene: Option<PathBuf>,
     #[command(flatten)]
@@ -59,7 +59,7 @@ pub(super) struct CompressArgs {
 }
 
 const EXAMPLES: &str = "\
-Options under Scene are for a file; a run brings its own.
+Options under Scene are for a model file; a run brings its own.
 
 Examples:
   densify compress output/garden-diet --to 5MiB -o garden.sog

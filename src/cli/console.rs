@@ -1,4 +1,4 @@
-//! Standard output and standard error, with a progress bar below them.
+//! Standard output and standard error, with progress bars below the last line.
 
 use std::cell::RefCell;
 use std::fmt;
@@ -20,7 +20,7 @@ const LOG_FILTER: &str = "warn,densify=info,densify_policies=info";
 /// The output of a command.
 #[derive(Debug)]
 pub(super) struct Console {
-    /// Only results and errors are shown.
+    /// True if only results and errors are shown.
     pub(super) quiet: bool,
     /// The progress bars; lines are printed above them.
     pub(super) bars: MultiProgress,
@@ -29,7 +29,7 @@ pub(super) struct Console {
 }
 
 impl Console {
-    /// A console for this process; also sets up the log.
+    /// A console for this process. Also sets up the log.
     pub(super) fn new(quiet: bool) -> Self {
         let bars = MultiProgress::new();
         let wanted = std::env::var("RUST_LOG").ok().filter(|_| !quiet);

@@ -14,7 +14,7 @@ use densify_run::failure::Failure;
 ///
 /// Choose one with `--gpu NAME`. The largest budget is what one buffer of the adapter can hold; drivers do
 /// not report the total memory. `WGPU_BACKEND` (vulkan, metal, dx12) and, for Vulkan, `VK_DRIVER_FILES`
-/// select the drivers. Accumulation is the way gradients are added up: slots is deterministic, atomics and
+/// select the drivers. Accumulation is the way gradients are added up: slots is deterministic; atomics and
 /// cas are faster (`train --knob accumulation=NAME`, `train --deterministic`).
 #[derive(Debug, Args)]
 pub(super) struct DevicesArgs {}
@@ -27,7 +27,7 @@ pub(super) fn run(_: &DevicesArgs, console: &Console) -> Result<(), Failure> {
             AdapterKind::Integrated => "integrated GPU",
             AdapterKind::Virtual => "virtual GPU",
             AdapterKind::Software => "software; used only on request",
-            AdapterKind::Unknown => "of unknown kind",
+            AdapterKind::Unknown => "unknown kind",
         };
         console.result(format_args!("{}", adapter.name));
         console.result(format_args!("  {kind}; {}, {}", adapter.interface, adapter.driver));

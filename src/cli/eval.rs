@@ -23,9 +23,9 @@ use densify_train::output::{write_geometry, write_scores};
 /// Measures a model against the photographs of its scene: PSNR, SSIM, FLIP, and LPIPS on request.
 ///
 /// Prints the scores of each view and their mean, and writes those of a run to results.json and
-/// per_view.json in its folder (results_train.json and per_view_train.json for the views trained on). For a
-/// file of Gaussian splats, and with --antialias, nothing is written. For a file, every 8th photograph is measured
-/// unless the dataset or an option selects others. Where the geometry is known (built-in scenes, and those that
+/// per_view.json in its folder (results_train.json and per_view_train.json for training views). For a file of
+/// Gaussian splats, and with --antialias, nothing is written. For a file, every 8th photograph is measured unless
+/// the dataset or an option selects others. Where the geometry is known (built-in scenes, and those that
 /// `densify scenegen` wrote), also measures how well the Gaussians match it: in a second table, and in geometry.json
 /// (geometry_train.json).
 #[derive(Debug, Args)]
@@ -63,7 +63,7 @@ pub(super) struct EvalArgs {
 }
 
 const EXAMPLES: &str = "\
-Options under Scene are for a file; a run brings its own.
+Options under Scene are for a model file; a run brings its own.
 
 Examples:
   densify eval output/garden-diet
@@ -75,7 +75,7 @@ Examples:
 pub(super) fn run(args: &EvalArgs, matches: &ArgMatches, console: &Console) -> Result<(), Failure> {
     let model = &args.model;
     let limits = Limits { lowest: &args.fail_below, highest: &args.fail_above };
-    // A folder without config.toml is not a run, and is refused whatever else it holds.
+    // A folder without config.toml is not a run, and is refused whatever other files it holds.
     let run = if is_model(model) {
         None
     } else {
@@ -116,7 +116,7 @@ pub(super) fn run(args: &EvalArgs, matches: &ArgMatches, console: &Console) -> R
     if let Some(FittedScore { psnr, ssim, flip, lpips }) = mean.fitted {
         line("fitted", psnr, ssim, flip, lpips);
     }
-    // Scores with another antialiasing than the trained one are not those of the run.
+    // Scores with an antialiasing other than that of training are not scores of the run.
     let written = run.filter(|_| args.rendering.antialias.is_none());
     if let Some((_, iteration)) = written {
         write_scores(model, args.split, iteration, &scores)?;
@@ -144,7 +144,7 @@ fn with_option_names(error: LimitError) -> Failure {
     Failure::new(code, message)
 }
 
-/// The geometric measurements, one per line; lengths as percentages of the diagonal.
+/// The geometric measurements, one per line, with lengths as percentages of the scene's diagonal.
 fn format_table(geometry: &Geometry) -> String {
     let Geometry { depth, normal_error, centres, floaters, thin, redundancy } = geometry;
     let plain = |value: f64, unit: &str| {

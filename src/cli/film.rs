@@ -9,17 +9,17 @@ use densify_core::camera_path::MAX_SIDE;
 use densify_inspect::{CameraRoute, Channels, Film, FilmError, FilmOptions, FilmSource};
 use densify_run::failure::{DEVICE, Failure, OTHER};
 
-/// Largest number of frames.
+/// Maximum number of frames.
 const MAX_FRAMES: u32 = 100_000;
 
 /// Options of a camera path.
 #[derive(Debug, Args)]
 #[command(next_help_heading = "Camera path")]
 pub(super) struct FilmArgs {
-    /// Render along a camera path instead of the dataset's views: orbit (once around the centre of the cameras' view),
-    /// spiral (two turns in front of it), or a camera path saved by the page of `densify view` or by nerfstudio's
-    /// viewer (JSON). A file must be in the dataset's coordinates, as the page writes it; nerfstudio uses these
-    /// coordinates if it trained with `--orientation-method none --center-method none --auto-scale-poses False`
+    /// Render along a camera path instead of the dataset's views: orbit (once around the point that the cameras look
+    /// at), spiral (two turns in front of it), or a camera path saved by the page of `densify view` or by nerfstudio's
+    /// viewer (JSON). A file must be in the dataset's coordinates. The page writes such files; nerfstudio does if it
+    /// trained with `--orientation-method none --center-method none --auto-scale-poses False`
     #[arg(long, value_name = "orbit|spiral|FILE")]
     pub(super) path: Option<CameraRoute>,
     /// Number of frames `[default: 120; for a file, its seconds times its fps, or one per camera]`

@@ -1,4 +1,4 @@
-//! The options of a run as flags: shows their defaults in the help, and finds which were given.
+//! The options of a run as flags: shows their defaults in the help, and finds those that were given.
 
 use std::ffi::OsString;
 
@@ -115,10 +115,10 @@ mod tests {
     #[test]
     fn only_given_options_are_parsed() {
         let options = ["--near", "0.04", "--eval", "--knob", "alpha_min=1/64", "--lr=opacity=0.05"];
-        let found = parse_words(&options.map(str::to_owned), "train").unwrap();
-        let names: Vec<&str> = found.iter().map(|(name, _)| name).collect();
+        let given = parse_words(&options.map(str::to_owned), "train").unwrap();
+        let names: Vec<&str> = given.iter().map(|(name, _)| name).collect();
         assert_eq!(names, ["eval", "knob", "lr", "near"]);
-        let spec = found.describe().unwrap();
+        let spec = given.describe().unwrap();
         assert!(spec.data.eval && spec.schedule.iterations.0 == 24_000);
     }
 

@@ -42,8 +42,8 @@ fn register() -> Arc<AtomicUsize> {
     let last = Arc::new(AtomicUsize::new(0));
     let was_interrupted = Arc::new(AtomicBool::new(false));
     for signal in [SIGINT, SIGTERM] {
-        // In this order, so that the first signal finds `was_interrupted` unset. Where registration fails, a signal
-        // ends the process as it does by default.
+        // Registered in this order, so that the first signal finds `was_interrupted` unset. If registration fails, a
+        // signal ends the process as it does by default.
         let exit_code = SIGNAL_EXIT_BASE + signal;
         let _ = flag::register_conditional_shutdown(signal, exit_code, was_interrupted.clone());
         let _ = flag::register_usize(signal, last.clone(), signal.unsigned_abs() as usize);

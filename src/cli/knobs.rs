@@ -32,7 +32,7 @@ pub(super) fn run(_: &KnobsArgs, console: &Console) -> Result<(), Failure> {
     Ok(())
 }
 
-/// The default, the valid values, and the backend if only one has the knob.
+/// The default, the valid values, and the backend if only one backend has the knob.
 fn describe_values(knob: &Knob) -> String {
     let unit = if knob.unit.is_empty() { String::new() } else { format!(" {}", knob.unit) };
     let on =

@@ -1,13 +1,13 @@
 //! The command line: arguments → validated options → run. No other crate prints.
 //!
 //! There is one file per subcommand. Exit codes: 0 success; 2 bad input or usage; 3 the device or the memory is
-//! insufficient; 4 `eval` found a limit exceeded; 130 and 143 SIGINT or SIGTERM ended the run; 1 anything else. An
-//! error is one message that names the file, field or flag and the remedy.
+//! insufficient; 4 `eval` measured a value beyond its limit; 130 and 143 SIGINT or SIGTERM ended the run; 1 anything
+//! else. An error is one message that names the file, field or flag and the remedy.
 //!
 //! A program with its own policies takes two lines:
 //!
 //! ```no_run
-//! // use my_policies as _;   // linked, therefore registered
+//! // use my_policies as _;   // linked, and therefore registered
 //! fn main() -> std::process::ExitCode {
 //!     densify_cli::run()
 //! }
@@ -77,7 +77,7 @@ Examples:
   densify train data/garden --policy vanilla --budget 1M   another policy, at most a million Gaussians
   densify plan data/garden --memory 512MiB                 the largest model that fits this memory
   densify eval output/garden-diet                          PSNR and SSIM of the photographs held out
-  densify render output/garden-diet -o pictures            the same views as PNG files
+  densify render output/garden-diet -o pictures            those views, rendered to PNG files
   densify view output/garden-diet                          the model in the browser
   densify report output/garden-diet -o garden.html         scores, curves and pictures as one file
   densify export output/garden-diet -o garden.ply          the model as a file for other programs
@@ -107,7 +107,7 @@ enum Command {
     /// Prints the memory that a run would take, without training.
     ///
     /// Takes the options of `densify train` and prints the memory that the run would reserve, buffer by
-    /// buffer, and then how many Gaussians fit the same memory at each spherical-harmonic degree and
+    /// buffer, and then how many Gaussians fit into the same memory at each spherical-harmonic degree and
     /// with images of full, half and quarter size. Writes nothing.
     #[command(after_help = PLAN_EXAMPLES)]
     Plan(Box<train::TrainArgs>),

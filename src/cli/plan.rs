@@ -8,7 +8,7 @@ use super::train::{Follower, TrainArgs};
 use densify_run::failure::Failure;
 use densify_run::plan;
 
-/// Prints the ledger of a run, and the models that would fit the same memory. Writes nothing.
+/// Prints the ledger of a run, and the sizes of models that would fit into the same memory. Writes nothing.
 pub(super) fn run(
     args: &TrainArgs,
     matches: &ArgMatches,

@@ -14,7 +14,7 @@ use densify_run::failure::Failure;
 pub(super) struct PoliciesArgs {
     /// Policy to explain: its decisions, source and parameters
     name: Option<String>,
-    /// A second name, which is refused
+    /// A second name; it is refused with a hint
     #[arg(hide = true)]
     more: Option<String>,
 }

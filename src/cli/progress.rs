@@ -9,7 +9,7 @@ use indicatif::{ProgressBar, ProgressState, ProgressStyle};
 use super::console::Console;
 use densify_core::numbers::{duration, grouped};
 
-/// Interval between lines of progress when standard error is not a terminal.
+/// Interval between lines of progress if standard error is not a terminal.
 const LINE_INTERVAL: Duration = Duration::from_secs(30);
 /// Interval between redraws of the bar.
 const REDRAW_INTERVAL: Duration = Duration::from_millis(100);

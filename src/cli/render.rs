@@ -24,7 +24,7 @@ use densify_train::evaluate::Split;
 /// --scene for the cameras); or, with --path, a camera path through the scene, and a film of it.
 ///
 /// Depth is Σ α·T·z along each ray, in the dataset's own units: opaque surfaces show their
-/// distance along the optical axis. It is written in 16 bits, where 65535 stands for the largest
+/// distance along the optical axis. Depth is written in 16 bits, where 65535 stands for the largest
 /// depth of the picture, which is in depth.json.
 #[derive(Debug, Args)]
 #[command(after_help = EXAMPLES)]
@@ -68,7 +68,7 @@ pub(super) struct RenderingArgs {
     #[arg(long, value_name = "FRACTION", help_heading = "Scene")]
     pub(super) near: Option<Fraction>,
     /// Antialiasing to render with, instead of what the file states: a kernel of 0.3 px² (most programs) or 0.1 (Brush,
-    /// LichtFeld, Mip-Splatting), or none. The PLY of the original trainer does not state it
+    /// LichtFeld, Mip-Splatting), or none. PLY files of the original trainer do not state their antialiasing
     #[arg(
         long, value_name = "KERNEL", num_args = 0..=1, require_equals = true, default_missing_value = "0.3",
         help_heading = "Rendering"
@@ -81,7 +81,7 @@ pub(super) struct RenderingArgs {
 }
 
 const EXAMPLES: &str = "\
-Options under Scene are for a file; a run brings its own.
+Options under Scene are for a model file; a run brings its own.
 
 Examples:
   densify render output/garden-diet -o pictures --side-by-side
@@ -136,7 +136,7 @@ pub(super) fn run(
     Ok(())
 }
 
-/// Fails if an option was given that applies only to a model file; a run has its own value.
+/// Fails if an option was given that applies only to model files; a run has values of its own.
 pub(super) fn refuse_scene_options(matches: &ArgMatches) -> Result<(), Failure> {
     let scene = DataSpec::augment_args(clap::Command::new("scene"));
     let names = scene.get_arguments().map(|argument| argument.get_id().as_str()).chain(["near"]);
@@ -178,8 +178,8 @@ impl ModelArgument<'_> {
             RunConfig::read(self.model)?;
             let iteration = iteration(self.model, self.iteration)?;
             let moved_to = self.scene.map(Path::to_owned);
-            let how = (rendering.antialias, machine);
-            return open_run(self.model, iteration, moved_to, how, needs, console);
+            let options = (rendering.antialias, machine);
+            return open_run(self.model, iteration, moved_to, options, needs, console);
         }
         let Some(scene) = self.scene else {
             return Err(Failure::input(format!(

@@ -19,8 +19,8 @@ use densify_run::failure::Failure;
 /// The file is self-contained and loads nothing: it can be mailed, and opens in any browser. It holds the
 /// scores, the worst and the best held-out views with a slider between photograph and render, an orbit of the
 /// scene, curves of loss, Gaussians, PSNR and memory, the edits, the automatic reductions, and the settings. Runs
-/// that differ only in their seed form a group: their results are averaged, with 95 % intervals from three runs
-/// on, and the pictures are those of the smallest seed. Groups of the same scene share their diagrams.
+/// that differ only in their seed form a group: their results are averaged, with 95 % intervals if there are three
+/// or more, and the pictures are those of the smallest seed. Groups of the same scene share their diagrams.
 #[derive(Debug, Args)]
 #[command(after_help = EXAMPLES)]
 pub(super) struct ReportArgs {
@@ -36,7 +36,7 @@ pub(super) struct ReportArgs {
     /// Saved iteration of the runs `[default: the last of each]`
     #[arg(long, value_name = "N")]
     iteration: Option<u32>,
-    /// Folder or ZIP archive of the dataset, if it has moved
+    /// Folder or ZIP archive of the dataset, if the dataset has moved
     #[arg(long, value_name = "DIR")]
     scene: Option<PathBuf>,
     #[command(flatten)]

@@ -22,8 +22,8 @@ use densify_train::pictures::write_png;
 /// INPUT is a .gltf, .glb or .obj file; --preset names a built-in scene instead. Writes images with
 /// alpha, depth and normals (EXR), cameras for NeRF-synthetic readers (transforms_train.json,
 /// transforms_test.json), for nerfstudio (transforms.json, with depth as .npy) and for COLMAP
-/// (sparse/0), initial points (points3d.ply), the mesh as traced (mesh.ply), and a record of it all
-/// (scene.json). Built-in scenes can be trained on without any file: densify train scene:NAME.
+/// (sparse/0), initial points (points3d.ply), the mesh as traced (mesh.ply), and a description of the
+/// scene (scene.json). Built-in scenes can be trained on without any file: densify train scene:NAME.
 #[derive(Debug, Args)]
 #[command(after_help = EXAMPLES)]
 pub(super) struct ScenegenArgs {
@@ -55,7 +55,7 @@ pub(super) struct ScenegenArgs {
     /// Views held out, on a path of their own `[default: 20, or as the built-in scene says]`
     #[arg(long, value_name = "N", help_heading = "Cameras")]
     test: Option<u32>,
-    /// Image size in pixels: 400, or 640x480 `[default: 256, or as the built-in scene says]`
+    /// Image size in pixels, such as 400 or 640x480 `[default: 256, or as the built-in scene says]`
     #[arg(long, value_name = "SIZE", help_heading = "Cameras", value_parser = parse_size)]
     size: Option<(u32, u32)>,
     /// Horizontal field of view in degrees
@@ -76,7 +76,7 @@ pub(super) struct ScenegenArgs {
     #[arg(long, value_name = "SHARE", help_heading = "Cameras")]
     jitter: Option<f64>,
 
-    /// Samples along each side of a pixel: 4 makes 16
+    /// Samples along each side of a pixel: 4 means 16 samples per pixel
     #[arg(long, value_name = "N", help_heading = "Light", default_value_t = 4)]
     samples: u32,
     /// Sample occlusion of the sky, with this many rays per pixel
@@ -95,7 +95,7 @@ pub(super) struct ScenegenArgs {
     /// Make all materials diffuse: colours do not depend on the viewing direction
     #[arg(long, help_heading = "Light")]
     lambert: bool,
-    /// Factor on all light [default: 1; automatic with --sky and for meshes with lights of their own]
+    /// Factor on all light [default: 1; chosen automatically with --sky and for meshes with lights of their own]
     #[arg(long, value_name = "FACTOR", help_heading = "Light")]
     exposure: Option<f32>,
     /// Vary the exposure of training views by up to this many stops, and their white balance by up to 10 %. Test
@@ -112,7 +112,7 @@ pub(super) struct ScenegenArgs {
     /// Share of the points that are at random places
     #[arg(long, value_name = "SHARE", help_heading = "Points", default_value_t = 0.02)]
     outliers: f64,
-    /// Share of space without points, in patches of 2 % of the diagonal
+    /// Share of space to leave without points, in patches of 2 % of the diagonal
     #[arg(long, value_name = "SHARE", help_heading = "Points", default_value_t = 0.0)]
     dropout: f64,
     /// Put no points on thin structures
@@ -137,7 +137,7 @@ Examples:
   densify scenegen mesh.glb -o data/mesh --sky studio.hdr --ao 64
   densify scenegen mesh.glb --contact-sheet look.png";
 
-/// [`RigKind`] on the command line.
+/// The [`RigKind`], as named on the command line.
 #[derive(Debug, Clone, Copy, ValueEnum)]
 enum RigArg {
     /// Rings around the scene

@@ -20,7 +20,7 @@ use densify_selftest::{Case, Finding, Subject, SubjectReport, cases, markdown, t
 /// shares no arithmetic with the first. Prints the largest error of each kind, its place and its
 /// tolerance. Include this table in a bug report.
 ///
-/// The exit code is 1 if anything is beyond its tolerance.
+/// The exit code is 1 if any figure is beyond its tolerance.
 #[derive(Debug, Args)]
 #[command(after_help = EXAMPLES)]
 pub(super) struct SelftestArgs {
@@ -47,9 +47,9 @@ Examples:
   densify selftest --backend cpu 7 13           only needles and layers
   densify selftest --gpu radeon                 on this adapter
   densify selftest --all --long --markdown selftest.md
-                                                on all of them, in full, into a file";
+                                                on every backend, with the long cases, into a file";
 
-/// Some cases compare two runs bit by bit; on a GPU, only this accumulation is reproducible.
+/// The accumulation on GPUs. Some cases compare two runs bit by bit, and only this accumulation is reproducible.
 const ACCUMULATION: Option<Accumulation> = Some(Accumulation::Slots);
 
 pub(super) fn run(args: &SelftestArgs, console: &Console) -> Result<(), Failure> {

@@ -5,7 +5,7 @@ use densify_run::finished::Machine;
 use densify_run::{DeviceSpec, Observer, Threads};
 
 /// Limits rayon's global pool, which reads datasets and measures models, to the number of threads from the command
-/// line. Only a command may do so: the pool belongs to the process, not to the library.
+/// line. Only a command may limit the pool: it belongs to the process, not to the library.
 pub(super) fn limit(threads: Option<Threads>) {
     if let Some(threads) = threads {
         // Fails only if the pool is already in use; it then keeps its size.

@@ -49,8 +49,8 @@ pub(super) struct ViewArgs {
 }
 
 const EXAMPLES: &str = "\
-Options under Scene are for a file or a scene; a run brings its own. To view the page from another
-machine without --host, run on that machine: ssh -L 8080:127.0.0.1:8080 NAME, with the name of this one, and open
+Options under Scene are for a model file or a scene; a run brings its own. To view the page from another
+machine without --host, run there: ssh -L 8080:127.0.0.1:8080 NAME, where NAME is this machine, and open
 http://127.0.0.1:8080/.
 
 Examples:
@@ -64,7 +64,7 @@ pub(super) fn run(args: &ViewArgs, matches: &ArgMatches, console: &Console) -> R
     if view::is_run(&args.path) {
         refuse_scene_options(matches)?;
     }
-    // Bind the port first: a failure shows at once, and a model may take long to read.
+    // Bind the port first: a failure then shows at once, although a model may take long to read.
     let address = ListenAddress { host: args.host, port: args.port, needs_token: false };
     let server = Server::open(address)?;
     let RenderingArgs { near, antialias, device, data } = &args.rendering;
@@ -87,7 +87,7 @@ pub(super) fn run(args: &ViewArgs, matches: &ArgMatches, console: &Console) -> R
     console.result(format_args!("page     {}", server.url()));
     if server.is_public() {
         console.say(
-            "note: anyone who knows this address can open the page; on another machine, replace its host by the \
+            "note: anyone who knows this address can open the page; on another machine, replace its host with the \
              name of this machine",
         );
     }

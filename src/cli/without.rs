@@ -1,4 +1,4 @@
-//! Replacements for commands whose cargo feature this program was built without: they only print an error.
+//! Replacements for commands whose cargo feature is not built into this program: they only print an error.
 
 use std::ffi::OsString;
 
@@ -8,9 +8,9 @@ use super::console::Console;
 use densify_run::failure::Failure;
 
 /// The error for an option or command that needs a missing feature.
-pub(super) fn without(feature: &str, what: &str) -> String {
+pub(super) fn without(feature: &str, name: &str) -> String {
     format!(
-        "{what}: this program was built without the feature `{feature}` of the crate densify; add it to the \
+        "{name}: this program was built without the feature `{feature}` of the crate densify; add it to the \
          features of densify in Cargo.toml"
     )
 }

@@ -1,30 +1,30 @@
 //! The antialiasing that a model was trained with: how renderers treat Gaussians that are smaller than a pixel.
 //!
-//! Every renderer widens a projected Gaussian of covariance S `[px²]` to B = S + κ·I, so that it covers a pixel. With
-//! antialiasing it also lowers the opacity by ρ = √(det S / det B), so that the widening adds no light (Yu et al.,
-//! *Mip-Splatting*, CVPR 2024, equation 9). A model must be rendered as it was trained: without ρ, the small Gaussians
-//! of an antialiased model are too opaque.
+//! Every renderer widens a projected Gaussian of covariance S `[px²]` to B = S + κ·I, so that it covers about a
+//! pixel. With antialiasing, the renderer also multiplies the opacity by ρ = √(det S / det B), so that the widening
+//! adds no light (Yu et al., *Mip-Splatting*, CVPR 2024, equation 9). A model must be rendered as it was trained:
+//! without ρ, the small Gaussians of an antialiased model are too opaque.
 
 use std::fmt::{self, Display};
 use std::str::FromStr;
 
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
-/// The antialiasing of a model.
+/// The antialiasing that a model was trained with.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Antialiasing {
-    /// Opacities are not lowered; κ is 0.3 px².
+    /// No antialiasing: opacities are not lowered. κ is 0.3 px².
     #[default]
     None,
-    /// κ is 0.3 px²: the original's `--antialiasing`, gsplat, nerfstudio, Postshot, splat-transform, and
+    /// κ is 0.3 px², as in the original trainer's `--antialiasing`, gsplat, nerfstudio, Postshot, splat-transform, and
     /// `densify train --antialias`.
     Wide,
-    /// κ is 0.1 px²: Mip-Splatting, Brush, LichtFeld.
+    /// κ is 0.1 px², as in Mip-Splatting, Brush and LichtFeld.
     Narrow,
 }
 
 impl Antialiasing {
-    /// All kinds.
+    /// All variants.
     pub const ALL: [Self; 3] = [Self::None, Self::Wide, Self::Narrow];
 
     /// κ, the variance added to both axes of a projected Gaussian `[px²]`.
@@ -35,7 +35,7 @@ impl Antialiasing {
         }
     }
 
-    /// True if opacities are lowered by ρ.
+    /// True if opacities are multiplied by ρ.
     pub const fn is_on(self) -> bool {
         !matches!(self, Self::None)
     }
@@ -56,7 +56,7 @@ impl Display for Antialiasing {
     }
 }
 
-/// The text is not the name of an antialiasing.
+/// The text does not name an antialiasing kernel.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error(
     "`{0}` is not an antialiasing kernel; choose 0.3, 0.1 (Mip-Splatting, Brush, LichtFeld) or none"
@@ -67,8 +67,8 @@ impl FromStr for Antialiasing {
     type Err = AntialiasingError;
 
     fn from_str(text: &str) -> Result<Self, AntialiasingError> {
-        let found = Self::ALL.into_iter().find(|kind| kind.name() == text);
-        found.ok_or_else(|| AntialiasingError(text.to_owned()))
+        let kind = Self::ALL.into_iter().find(|kind| kind.name() == text);
+        kind.ok_or_else(|| AntialiasingError(text.to_owned()))
     }
 }
 
@@ -83,13 +83,13 @@ impl<'de> Deserialize<'de> for Antialiasing {
         /// The kernel may be given as text or as a number.
         #[derive(Deserialize)]
         #[serde(untagged, expecting = "expected 0.3, 0.1 or none")]
-        enum Stated {
+        enum TextOrNumber {
             Text(String),
-            Kernel(f64),
+            Number(f64),
         }
-        let text = match Stated::deserialize(from)? {
-            Stated::Text(text) => text,
-            Stated::Kernel(kernel) => kernel.to_string(),
+        let text = match TextOrNumber::deserialize(from)? {
+            TextOrNumber::Text(text) => text,
+            TextOrNumber::Number(kernel) => kernel.to_string(),
         };
         text.parse().map_err(serde::de::Error::custom)
     }

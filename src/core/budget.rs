@@ -8,7 +8,7 @@
 pub struct RowBudget {
     /// Maximum number of rows in total.
     pub total: usize,
-    /// Number of rows that never change.
+    /// Number of frozen rows.
     pub frozen: usize,
 }
 
@@ -30,12 +30,12 @@ impl RowBudget {
         self.total.saturating_sub(self.frozen)
     }
 
-    /// True for a frozen row.
+    /// True if a row is frozen.
     pub fn is_frozen(self, row: usize) -> bool {
         row < self.frozen
     }
 
-    /// The row's index among the trained rows, which policies use; `None` for a frozen row.
+    /// The row's index among the trained rows, by which policies identify it; `None` for a frozen row.
     pub fn trained_row(self, row: u32) -> Option<u32> {
         row.checked_sub(u32::try_from(self.frozen).ok()?)
     }

@@ -46,19 +46,19 @@ impl Camera {
         self.rotation.row(2)
     }
 
-    /// Projects a world point to pixel and depth (camera z). The pixel is meaningless where depth <= 0.
+    /// Projects a world point to its pixel coordinates and depth (camera z). The pixel is meaningless if depth <= 0.
     pub fn project(&self, world: DVec3) -> (DVec2, f64) {
         let p = self.rotation * world + self.translation;
         (DVec2::new(self.fx * p.x / p.z + self.cx, self.fy * p.y / p.z + self.cy), p.z)
     }
 
-    /// The depth of a world point in front of the camera whose projection is in the image; `None` for other points.
-    /// The image is extended on every side by `margin`, a fraction of that side.
+    /// The depth of a world point if it is in front of the camera and its projection is in the image; `None` otherwise.
+    /// The image is extended at every edge by `margin`, a fraction of its width or height.
     pub fn depth_in_image(&self, world: DVec3, margin: f64) -> Option<f64> {
         self.place_in_image(world, margin).map(|(_, depth)| depth)
     }
 
-    /// As [`depth_in_image`](Self::depth_in_image), with the pixel.
+    /// Like [`depth_in_image`](Self::depth_in_image), but returns the pixel coordinates, too.
     pub fn place_in_image(&self, world: DVec3, margin: f64) -> Option<(DVec2, f64)> {
         let (pixel, depth) = self.project(world);
         let within = |x: f64, size: u32| {
@@ -69,7 +69,7 @@ impl Camera {
             .then_some((pixel, depth))
     }
 
-    /// The same view with an image of another size; intrinsics scale per axis.
+    /// The same view with an image of a different size. The intrinsics of each axis are scaled separately.
     pub fn resized(&self, width: u32, height: u32) -> Self {
         let sx = f64::from(width) / f64::from(self.width);
         let sy = f64::from(height) / f64::from(self.height);

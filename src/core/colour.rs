@@ -21,8 +21,8 @@ pub struct ColourGradient {
     pub offset: [f32; 3],
 }
 
-/// Sums over the pixels of a transformed image from which [`ColourTransform::gradient`] follows. C' is the
-/// transformed colour, g the derivative of the loss with respect to it, T the transmittance.
+/// Sums over the pixels of a transformed image, from which [`ColourTransform::gradient`] is computed. C' is the
+/// transformed colour, g the derivative of the loss with respect to it, T the transmittance to the background.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct ExposureSums {
     /// Σ gᵢ·C'ⱼ, row-major.
@@ -34,7 +34,7 @@ pub struct ExposureSums {
 }
 
 impl ColourTransform {
-    /// The transform that changes nothing.
+    /// The transform that changes no colour.
     pub const IDENTITY: Self =
         Self { matrix: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], offset: [0.0; 3] };
 
@@ -56,8 +56,8 @@ impl ColourTransform {
         if back.is_finite() { back } else { Self::IDENTITY }
     }
 
-    /// The colour that the transform turns into `background`. Rendering over it keeps the background the same in
-    /// every photograph, whatever its exposure.
+    /// The colour that the transform turns into `background`. A scene rendered over this colour has the
+    /// same background in every photograph, whatever the exposure.
     pub fn behind(&self, background: [f32; 3]) -> [f32; 3] {
         self.inverse().apply(background)
     }
@@ -72,8 +72,8 @@ impl ColourTransform {
         DMat3::from_cols_array_2d(&rows).transpose().inverse()
     }
 
-    /// The gradient with respect to this transform, for an image rendered over [`behind`](Self::behind) of
-    /// `background`.
+    /// The gradient of the loss with respect to this transform, for an image rendered over the colour that
+    /// [`behind`](Self::behind) returns for `background`.
     pub fn gradient(&self, background: [f32; 3], sums: &ExposureSums) -> ColourGradient {
         let inverse = self.inverse_matrix();
         let behind = self.behind(background);
@@ -102,7 +102,7 @@ impl ColourTransform {
 mod tests {
     use super::*;
 
-    const SOME: ColourTransform = ColourTransform {
+    const EXAMPLE: ColourTransform = ColourTransform {
         matrix: [[1.25, 0.0625, -0.125], [0.0, 0.75, 0.25], [-0.0625, 0.125, 1.5]],
         offset: [0.03, -0.05, 0.1],
     };
@@ -110,47 +110,47 @@ mod tests {
     #[test]
     fn the_inverse_restores_colours() {
         let colour = [0.2, 0.9, 0.4];
-        let back = SOME.inverse().apply(SOME.apply(colour));
+        let back = EXAMPLE.inverse().apply(EXAMPLE.apply(colour));
         assert!(back.iter().zip(colour).all(|(a, b)| (a - b).abs() < 1e-6), "{back:?}");
-        let flat = ColourTransform { matrix: [[1.0; 3]; 3], ..SOME };
+        let flat = ColourTransform { matrix: [[1.0; 3]; 3], ..EXAMPLE };
         assert_eq!(flat.inverse(), ColourTransform::IDENTITY, "this transform has no inverse");
     }
 
     #[test]
     fn the_background_looks_the_same_with_any_exposure() {
         let background = [0.0, 0.5, 1.0];
-        let seen = SOME.apply(SOME.behind(background));
+        let seen = EXAMPLE.apply(EXAMPLE.behind(background));
         assert!(seen.iter().zip(background).all(|(a, b)| (a - b).abs() < 1e-6), "{seen:?}");
     }
 
-    /// A pixel of which the scene covers 1 − T: matrix·F + offset·(1 − T) + T·background.
+    /// A pixel with foreground F and transmittance T shows matrix·F + offset·(1 − T) + T·background.
     #[test]
-    fn gradients_are_those_of_the_foreground_alone() {
-        let (foreground, light, background) = ([0.3, 0.2, 0.6], 0.25_f32, [0.5, 1.0, 0.125]);
+    fn gradients_exclude_the_background() {
+        let (foreground, t, background) = ([0.3, 0.2, 0.6], 0.25_f32, [0.5, 1.0, 0.125]);
         let upstream = [0.7, -1.1, 0.4];
-        let behind = SOME.behind(background);
-        let pixel: [f32; 3] = std::array::from_fn(|i| foreground[i] + light * behind[i]);
-        let shown = SOME.apply(pixel);
+        let behind = EXAMPLE.behind(background);
+        let pixel: [f32; 3] = std::array::from_fn(|i| foreground[i] + t * behind[i]);
+        let shown = EXAMPLE.apply(pixel);
         let expected: [f32; 3] = std::array::from_fn(|i| {
-            let [x, y, z] = SOME.matrix[i];
+            let [x, y, z] = EXAMPLE.matrix[i];
             let [r, g, b] = foreground;
-            x * r + y * g + z * b + SOME.offset[i] * (1.0 - light) + light * background[i]
+            x * r + y * g + z * b + EXAMPLE.offset[i] * (1.0 - t) + t * background[i]
         });
         assert!(shown.iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-6), "{shown:?}");
         let g = upstream.map(f64::from);
         let sums = ExposureSums {
             by_colour: g.map(|g| shown.map(|colour| g * f64::from(colour))),
             plain: g,
-            behind: g.map(|g| g * f64::from(light)),
+            behind: g.map(|g| g * f64::from(t)),
         };
-        let found = SOME.gradient(background, &sums);
+        let gradient = EXAMPLE.gradient(background, &sums);
         for (i, upstream) in upstream.into_iter().enumerate() {
             for (j, foreground) in foreground.into_iter().enumerate() {
-                let by = upstream * foreground;
-                assert!((found.matrix[i][j] - by).abs() < 1e-6, "{i}, {j}: {found:?}");
+                let error = gradient.matrix[i][j] - upstream * foreground;
+                assert!(error.abs() < 1e-6, "{i}, {j}: {gradient:?}");
             }
-            let by = upstream * (1.0 - light);
-            assert!((found.offset[i] - by).abs() < 1e-6, "{i}: {found:?}");
+            let error = gradient.offset[i] - upstream * (1.0 - t);
+            assert!(error.abs() < 1e-6, "{i}: {gradient:?}");
         }
     }
 }

@@ -1,13 +1,13 @@
 //! Morton codes (Morton 1966): positions on a Z-order curve through space, by which the initial rows are sorted.
 //!
 //! Neighbours in memory are then neighbours in the scene: the rows of a block are mostly visible together or not
-//! at all, and those of a tile share cache lines.
+//! at all, and the rows in a tile of the image share cache lines.
 
 /// Bits per axis.
 const BITS: u32 = 10;
 
 /// The Morton code of a point. Coordinates are compressed to (−1, 1), so that no bounds are needed and outliers
-/// do no harm; the scene's extent is about 1.
+/// do no harm. The scene's extent should be about 1.
 pub fn morton_code(point: [f64; 3]) -> u32 {
     let [x, y, z] = point.map(|x| {
         let squeezed = x / (1.0 + x.abs());
@@ -17,7 +17,7 @@ pub fn morton_code(point: [f64; 3]) -> u32 {
     x | y << 1 | z << 2
 }
 
-/// Inserts two zeros between neighbouring bits of a number below 2^[`BITS`].
+/// Inserts two zeros between neighbouring bits of a number. Numbers of more than [`BITS`] bits are clamped.
 fn spread_bits(x: u32) -> u32 {
     let x = x.min((1 << BITS) - 1);
     let x = (x | x << 16) & 0x0300_00ff;
@@ -31,7 +31,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn bits_of_three_numbers_alternate() {
+    fn codes_interleave_the_bits_of_coordinates() {
         for x in [0, 1, 2, 5, 0b10_1101_0011, (1 << BITS) - 1] {
             let bits: u32 = (0..BITS).map(|i| (x >> i & 1) << (3 * i)).sum();
             assert_eq!(spread_bits(x), bits, "{x:#b}");

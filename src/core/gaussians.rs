@@ -34,13 +34,13 @@ impl ModelArray {
     pub const ALL: [Self; 5] =
         [Self::Means, Self::LogScales, Self::Quats, Self::OpacityLogits, Self::Sh];
 
-    /// The array that holds a parameter of a row, by its index.
+    /// The array that holds the parameter with this index in a row.
     pub fn of_parameter(index: usize) -> Self {
         let holds = |array: &Self| array.parameters(MAX_SH_DEGREE).contains(&index);
         Self::ALL.into_iter().find(holds).unwrap_or(Self::Sh)
     }
 
-    /// The indices of the array's values among a row's parameters at a degree.
+    /// The indices of the array's values among a row's parameters at a spherical-harmonic degree.
     pub const fn parameters(self, sh_degree: u8) -> std::ops::Range<usize> {
         match self {
             Self::Means => 0..3,
@@ -59,8 +59,8 @@ pub struct Gaussians {
     pub sh_degree: u8,
     /// How the model is rendered where its Gaussians are smaller than a pixel.
     pub antialiasing: Antialiasing,
-    /// The point from which means are measured `[scene units]`: a position is a mean plus this. It is
-    /// 0 during training; elsewhere it may be nonzero, for scenes whose coordinates would be too coarse in f32.
+    /// The point from which means are measured `[scene units]`: a position is a mean plus `origin`. It
+    /// is 0 during training; elsewhere it may be nonzero, for scenes whose coordinates would be too coarse in f32.
     pub origin: [f64; 3],
     /// Means, relative to `origin` `[scene units]`. Shape: `[rows]`.
     pub means: Vec<[f32; 3]>,
@@ -70,7 +70,7 @@ pub struct Gaussians {
     pub quats: Vec<[f32; 4]>,
     /// Opacity logits; opacity = 1 / (1 + exp(−logit)). Shape: `[rows]`.
     pub opacity_logits: Vec<f32>,
-    /// Coefficient-major, RGB last. Shape: `[rows, (degree + 1)², 3]`.
+    /// Spherical-harmonic coefficients, RGB last. Shape: `[rows, (degree + 1)², 3]`.
     pub sh: Vec<f32>,
 }
 
@@ -78,7 +78,7 @@ impl Gaussians {
     /// Builds a model without antialiasing from its arrays, each row-major.
     ///
     /// # Errors
-    /// The first error of `array`.
+    /// The first error that `array` returns.
     pub fn from_arrays<E>(
         sh_degree: u8,
         mut array: impl FnMut(ModelArray) -> Result<Vec<f32>, E>,
@@ -121,7 +121,7 @@ impl Gaussians {
         })
     }
 
-    /// True if means are measured from another point than 0.
+    /// True if means are measured from a point other than 0.
     pub fn is_local(&self) -> bool {
         self.origin.iter().any(|&axis| axis != 0.0)
     }
@@ -163,7 +163,7 @@ impl Gaussians {
     /// origin.
     ///
     /// # Panics
-    /// When degree or antialiasing differ.
+    /// When the degrees or the antialiasing differ.
     pub fn append(&mut self, mut other: Self) {
         assert_eq!(self.sh_degree, other.sh_degree, "models of different degrees cannot be joined");
         assert_eq!(
@@ -181,7 +181,7 @@ impl Gaussians {
         self.sh.append(&mut other.sh);
     }
 
-    /// The given rows, in that order.
+    /// A model of the given rows, in the given order.
     ///
     /// # Panics
     /// When a row does not exist.
@@ -215,7 +215,7 @@ impl Gaussians {
     }
 }
 
-/// Groups numbers by N; in place if the allocation permits.
+/// Groups numbers into arrays of `N`, without a copy if the allocation permits.
 fn in_rows<const N: usize>(values: Vec<f32>) -> Vec<[f32; N]> {
     bytemuck::try_cast_vec(values).unwrap_or_else(|(_, values)| values.as_chunks().0.to_vec())
 }

@@ -14,7 +14,7 @@ const MAX_ROWS: f64 = u32::MAX as f64;
 /// Parses a number of Gaussians: `200000`, `28k`, `1.5M`.
 ///
 /// # Errors
-/// A message with the spellings accepted.
+/// A message with the accepted spellings.
 pub fn rows(text: &str) -> Result<usize, String> {
     let wrong =
         || format!("`{text}` is not a number of Gaussians; write it as 200000, 200k or 1.5M");
@@ -44,7 +44,7 @@ pub fn rows(text: &str) -> Result<usize, String> {
 /// Parses a number of bytes: `1GiB`, `512MiB`, `800MB`, `1000000`.
 ///
 /// # Errors
-/// A message with the spellings accepted.
+/// A message with the accepted spellings.
 pub fn bytes(text: &str) -> Result<u64, String> {
     const UNITS: [(&str, f64); 10] = [
         ("KiB", 1024.0),
@@ -126,7 +126,7 @@ pub fn duration(time: Duration) -> String {
     }
 }
 
-/// Deserialises a number or a string by the type's `FromStr`, as the command line would.
+/// Deserialises a number or a string by the type's `FromStr`, as the command line does.
 ///
 /// # Errors
 /// The errors of `FromStr`.

@@ -178,7 +178,7 @@ mod tests {
                 up[axis] += h;
                 down[axis] -= h;
                 let numeric = (value(up) - value(down)) / f64::from(up[axis] - down[axis]);
-                // The cubic bands leave an h² term.
+                // For the cubic band, central differences have an error of order h².
                 assert!((f64::from(analytic[axis]) - numeric).abs() < 2e-3);
             }
         }

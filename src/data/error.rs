@@ -75,7 +75,7 @@ impl LoadError {
         }
     }
 
-    /// A file that contradicts its format or itself; `field` names the record, line or field.
+    /// A file contradicts its format or itself; `field` names the record, line or field.
     pub(crate) fn malformed(
         path: &Path,
         field: impl Display,
@@ -123,7 +123,7 @@ impl LoadError {
     pub(crate) fn size(path: &Path, (width, height): (u32, u32), camera: (u32, u32)) -> Self {
         Self::Data(format!(
             "{} is {width}x{height} px, but its camera says {}x{} px; use the images that the cameras were \
-             estimated from, or a proportional rescale of them",
+             estimated from, or proportionally rescaled copies of them",
             path.display(),
             camera.0,
             camera.1
@@ -140,7 +140,7 @@ impl LoadError {
         ))
     }
 
-    /// An image that a field of a file names does not exist.
+    /// An image named in a field of a file does not exist.
     pub(crate) fn missing_image(path: &Path, field: &str, image: &Path) -> Self {
         let problem = format!("the file {} does not exist", image.display());
         Self::remedied(path, field, problem, LoadRemedy::RestoreOrImagesFolder)

@@ -13,7 +13,7 @@ impl<T: BufRead + Seek> Input for T {}
 /// A reader of the format that the first bytes indicate.
 ///
 /// # Errors
-/// The bytes cannot be read.
+/// When the bytes cannot be read.
 pub(crate) fn reader<'a>(
     input: impl BufRead + Seek + 'a,
 ) -> io::Result<ImageReader<Box<dyn Input + 'a>>> {

@@ -16,7 +16,7 @@ const GREY: u8 = 128;
 /// all would be almost black.
 const BRIGHTEST: f64 = 16.0;
 
-/// A coloured point cloud in structure of arrays.
+/// A coloured point cloud as a structure of arrays.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct PointCloud {
     /// Positions. Shape: `[points]`.
@@ -36,9 +36,9 @@ impl PointCloud {
         self.positions.is_empty()
     }
 
-    /// At most `most` of the points, at equal intervals in their order.
-    pub fn thinned(&self, most: usize) -> Self {
-        let stride = self.len().div_ceil(most.max(1)).max(1);
+    /// At most `limit` of the points, at equal intervals in their order.
+    pub fn thinned(&self, limit: usize) -> Self {
+        let stride = self.len().div_ceil(limit.max(1)).max(1);
         Self {
             positions: self.positions.iter().copied().step_by(stride).collect(),
             colours: self.colours.iter().copied().step_by(stride).collect(),
@@ -55,9 +55,9 @@ impl PointCloud {
     }
 }
 
-/// Reads the vertices of a PLY file as points, and a note if they have no colours; other elements are skipped.
-/// Positions may be of any type and may be non-finite. In a model of Gaussian splats, points are Gaussians, with world
-/// positions even if the file has local coordinates.
+/// Reads the vertices of a PLY file as points; also returns a note if they have no colours. Other elements are skipped.
+/// Positions may be of any type and may be non-finite. The Gaussians of a splat model are read as points, in world
+/// coordinates even if the file has local ones.
 ///
 /// # Errors
 /// When the file is unreadable, contradicts itself, or its vertices have no x, y, z.
@@ -102,8 +102,8 @@ pub fn read_points(path: &Path) -> Result<(PointCloud, Option<String>), LoadErro
     Ok((points, note))
 }
 
-/// The value of a full colour channel: for bytes their largest value, otherwise the smallest usual value that no colour
-/// exceeds, because programs write colours of 0 to 255 in any type.
+/// The value of a full colour channel: for bytes, the largest value of their type; otherwise, the smallest usual value
+/// that no colour exceeds, because programs write colours of 0 to 255 in any type.
 ///
 /// # Errors
 /// When floating-point colours exceed all usual values.

@@ -20,9 +20,9 @@ pub enum NumberKind {
 /// A row with a non-finite number, and the first such number.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct NonFinite {
-    /// The row.
+    /// Index of the row.
     pub row: u32,
-    /// The array that the parameter belongs to.
+    /// The array that the number or its parameter belongs to.
     pub array: ModelArray,
     /// The kind of number.
     pub kind: NumberKind,

@@ -156,7 +156,7 @@ impl Device {
         }
     }
 
-    /// Bytes of a ledger that count against a memory limit: those on the GPU if it is used, else all.
+    /// Bytes of a ledger that count against a memory limit: on a GPU only the bytes in its memory, else all bytes.
     pub fn limited_bytes(&self, ledger: &Ledger) -> u64 {
         match self {
             Self::Processor => ledger.total(),
@@ -188,7 +188,7 @@ impl Device {
     /// Makes a backend that holds the model.
     ///
     /// # Errors
-    /// When the limits of the device or the memory do not suffice.
+    /// When the device's limits or memory do not suffice.
     pub fn backend(
         &self,
         model: &Gaussians,

@@ -8,16 +8,16 @@ use densify_core::image::Image8;
 /// The gradient of a loss with respect to an image.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ImageGradient {
-    /// With respect to colour. Shape: `[height, width, 3]`.
+    /// Gradient with respect to colour. Shape: `[height, width, 3]`.
     pub rgb: Vec<f32>,
-    /// With respect to alpha. Shape: `[height, width]`.
+    /// Gradient with respect to alpha. Shape: `[height, width]`.
     pub alpha: Vec<f32>,
-    /// With respect to depth. Shape: `[height, width]`.
+    /// Gradient with respect to depth. Shape: `[height, width]`.
     pub depth: Vec<f32>,
 }
 
 impl ImageGradient {
-    /// Panics unless it has the size of the camera's image.
+    /// Panics unless the gradient has the size of the camera's image.
     pub(super) fn assert_size(&self, camera: &Camera) {
         let pixels = camera.width as usize * camera.height as usize;
         assert_eq!(self.rgb.len(), 3 * pixels, "upstream.rgb");

@@ -10,9 +10,9 @@ pub enum BackendError {
     /// A planned buffer cannot be allocated.
     #[error("cannot allocate {bytes} bytes for {what}")]
     OutOfMemory {
-        /// The buffer.
+        /// What the memory was for.
         what: &'static str,
-        /// Its size.
+        /// The size of the allocation `[bytes]`.
         bytes: u64,
     },
     /// The worker threads cannot be started.
@@ -42,11 +42,11 @@ pub enum BackendError {
     /// The adapter cannot hold the budget.
     #[error("a budget of {budget} rows: {device} holds at most {most} at degree {sh_degree}")]
     TooManyRows {
-        /// The budget.
+        /// The budget, in rows.
         budget: usize,
         /// The adapter's name.
         device: String,
-        /// The largest budget that it supports.
+        /// The largest budget that the adapter supports, in rows.
         most: u64,
         /// Spherical-harmonic degree of the model.
         sh_degree: u8,
@@ -58,13 +58,13 @@ pub enum BackendError {
     BufferTooLarge {
         /// The purpose of the buffer.
         buffer: &'static str,
-        /// Its size.
+        /// The size of the buffer `[bytes]`.
         bytes: u64,
         /// The adapter's name.
         device: String,
         /// The largest buffer supported `[bytes]`.
         most: u64,
-        /// The setting that would make it fit.
+        /// The setting that would make the buffer fit.
         fit: Fit,
     },
     /// The backend does not support the request.

@@ -96,7 +96,7 @@ pub struct StepInput<'a> {
     pub seed: u64,
 }
 
-/// A training view to measure for a policy's event.
+/// A training view to measure for a policy's edit.
 #[derive(Debug, Clone, Copy)]
 pub struct AuxInput<'a> {
     /// The iteration just finished, 1-based.
@@ -160,7 +160,7 @@ pub struct Rendering {
     pub rgb: Vec<f32>,
     /// 1 − final transmittance, in `[0, 1]`. Shape: `[height, width]`.
     pub alpha: Vec<f32>,
-    /// Σ α·T·z, camera z `[scene units]`, without a background term. Shape: `[height, width]`.
+    /// Σ α·T·z, where z is camera-space depth; the background adds nothing `[scene units]`. Shape: `[height, width]`.
     pub depth: Vec<f32>,
 }
 
@@ -170,8 +170,8 @@ fn assert_same_size(camera: &Camera, image: &Image8) {
     assert_eq!(camera, image, "camera and image differ in size");
 }
 
-/// Panics unless an edit plan fits the current rows and the budget. Checked in release builds too, because the memory
-/// limit depends on it.
+/// Panics unless an edit plan fits the current rows and the budget, in release builds too, because the memory limit
+/// depends on this check.
 fn assert_fits(ops: &RowOps, rows: usize, budget: RowBudget) {
     assert_eq!(ops.first_row, budget.frozen, "a plan for another number of frozen rows");
     assert_eq!(ops.rows_before, rows, "a plan for another number of rows");

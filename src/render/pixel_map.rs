@@ -8,7 +8,7 @@ use densify_policies::sample::weighted;
 use super::AuxInput;
 use densify_core::image::Image8;
 
-/// The pixel map of a rendering; see [`PixelMap`]. Shapes: `[height, width]`.
+/// The pixel map of a rendering; see [`PixelMap`]. Shape of rendering and map: `[height, width]`.
 pub(super) fn pixel_map(
     rgb: &[[f32; 3]],
     target: &Image8,
@@ -51,8 +51,8 @@ pub(super) fn sample_pixels(
         .collect()
 }
 
-/// Three standard deviations along the longer axis of a projected covariance [a b; b c], rounded up
-/// `[px]`. Computed from its factors 1/l1 = √(det/c), shear = b/c and 1/l3 = √c.
+/// Three standard deviations along the longer axis of a projected covariance [a b; b c], rounded up `[px]`. The
+/// covariance is given by its factors 1/l1 = √(det/c), shear = b/c and 1/l3 = √c.
 pub(super) fn radius_px(inv_l1: f32, shear: f32, inv_l3: f32) -> f32 {
     let c = inv_l3 * inv_l3;
     let b = shear * c;

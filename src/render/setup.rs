@@ -128,9 +128,9 @@ pub enum MomentStorage {
 /// renderers of Gaussian splats use as well.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Shortcuts {
-    /// A splat is not blended into pixels where its alpha is below this; above 0.
+    /// Smallest alpha that is blended, > 0: a splat is skipped in pixels where its alpha is lower.
     pub alpha_min: f32,
-    /// A pixel is finished before its transmittance falls to this; above 0.
+    /// A pixel is finished before the first splat that would reduce its transmittance to this value or below; > 0.
     pub transmittance_min: f32,
 }
 
@@ -141,8 +141,8 @@ impl Default for Shortcuts {
 }
 
 impl Shortcuts {
-    /// log₂ of 1/[`alpha_min`](Self::alpha_min): a splat covers the pixels where its exponent is at least the
-    /// negative of this.
+    /// log₂ of 1/[`alpha_min`](Self::alpha_min): a splat covers the pixels where its exponent is at least minus this
+    /// value.
     pub(crate) fn log2_reach(&self) -> f32 {
         -f64::from(self.alpha_min).log2() as f32
     }

@@ -100,11 +100,11 @@ impl RecordLayout {
 
     const fn with(fields: u8) -> Self {
         let mut extras = [0; Self::MOST - BASE];
-        let (mut field, mut place) = (0, 0);
+        let (mut field, mut count) = (0, 0);
         while field < Field::ALL.len() {
             if fields >> field & 1 == 1 {
-                extras[place] = Field::ALL[field].number() as u8;
-                place += 1;
+                extras[count] = Field::ALL[field].number() as u8;
+                count += 1;
             }
             field += 1;
         }
@@ -280,14 +280,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn exactly_the_attribute_signals_are_read_from_parameters_and_widths_agree() {
+    fn only_attribute_signals_are_read_from_parameters_and_their_widths_agree() {
         for signal in Signal::ALL {
-            let found = ParameterSignal::new(signal).map(|found| found.parameters.len());
+            let parameters = ParameterSignal::new(signal).map(|read| read.parameters.len());
             let width = match signal.kind() {
                 SignalKind::Attribute(width) => Some(width),
                 _ => None,
             };
-            assert_eq!(found, width, "{signal:?}");
+            assert_eq!(parameters, width, "{signal:?}");
         }
     }
 }

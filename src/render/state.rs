@@ -66,11 +66,11 @@ impl Tensor {
 /// The values of a [`Tensor`].
 #[derive(Debug, Clone, PartialEq)]
 pub enum Values {
-    /// Numbers.
+    /// 32-bit floats.
     F32(Vec<f32>),
-    /// Counts.
+    /// 16-bit counts.
     U16(Vec<u16>),
-    /// Flags and small numbers.
+    /// Flags and other bytes.
     U8(Vec<u8>),
 }
 
@@ -80,7 +80,7 @@ pub enum Values {
 pub struct StateError {
     /// The array's name.
     pub name: String,
-    /// The problem.
+    /// What is wrong with the array.
     pub problem: String,
 }
 
@@ -131,7 +131,7 @@ impl Values {
 }
 
 impl Tensor {
-    /// An array of numbers.
+    /// An array of floats.
     pub fn f32(name: impl Into<String>, shape: &[usize], values: Vec<f32>) -> Self {
         Self::new(name, shape, Values::F32(values))
     }
@@ -141,17 +141,17 @@ impl Tensor {
         Self::new(name, shape, Values::U16(values))
     }
 
-    /// An array of flags.
+    /// An array of bytes.
     pub fn u8(name: impl Into<String>, shape: &[usize], values: Vec<u8>) -> Self {
         Self::new(name, shape, Values::U8(values))
     }
 
     fn new(name: impl Into<String>, shape: &[usize], values: Values) -> Self {
-        debug_assert_eq!(shape.iter().product::<usize>(), values.len(), "values of a tensor");
+        debug_assert_eq!(shape.iter().product::<usize>(), values.len(), "a tensor's size");
         Self { name: name.into(), shape: shape.to_owned(), values }
     }
 
-    /// Takes the numbers of an array with this shape.
+    /// Returns the floats of an array that must have this shape.
     ///
     /// # Errors
     /// [`StateError`] when shape or type differ.
@@ -163,7 +163,7 @@ impl Tensor {
         }
     }
 
-    /// Takes the counts of an array with this shape.
+    /// Returns the counts of an array that must have this shape.
     ///
     /// # Errors
     /// [`StateError`] when shape or type differ.
@@ -175,7 +175,7 @@ impl Tensor {
         }
     }
 
-    /// Takes the flags of an array with this shape.
+    /// Returns the bytes of an array that must have this shape.
     ///
     /// # Errors
     /// [`StateError`] when shape or type differ.

@@ -6,7 +6,7 @@ use super::{Accumulation, AdapterChoice, AdapterSummary, BackendError, Different
 use densify_core::gaussians::Gaussians;
 use densify_core::memory::Ledger;
 
-/// An open device, which cannot exist.
+/// An open device, which cannot exist without the GPU backend.
 #[derive(Debug, Clone)]
 pub enum GpuDevice {}
 
@@ -54,7 +54,7 @@ pub fn adapters() -> Vec<AdapterSummary> {
     Vec::new()
 }
 
-/// Never true: without the backend no GPU can be used.
+/// False: without the GPU backend no GPU can be used.
 pub(super) fn may_be_present() -> bool {
     false
 }

@@ -6,9 +6,9 @@ use densify_render::Device;
 /// A part of the program that works alongside a run, with memory of its own. It does not affect the run's result.
 #[derive(Debug, Clone, Copy)]
 pub struct Companion {
-    /// Adds the bytes that the part needs to the ledger of a run of this size.
+    /// Adds the bytes that the companion needs to the ledger of a run of this size.
     pub reserve: fn(&CompanionSize<'_>, &mut Ledger),
-    /// Maximum number of the dataset's points that it receives.
+    /// Maximum number of the dataset's points that the companion receives.
     pub points: usize,
 }
 
@@ -21,10 +21,10 @@ pub struct CompanionSize<'a> {
     pub device: &'a Device,
     /// Width and height of the largest image `[px]`.
     pub largest_image: (u32, u32),
-    /// Bytes of one decoded photograph, plus the bytes for decoding it.
+    /// Bytes for reading one photograph: decoded images held meanwhile, plus the memory for decoding.
     pub photograph: u64,
     /// Number of views, training and test.
     pub views: usize,
-    /// Worker threads.
+    /// Number of worker threads.
     pub threads: usize,
 }

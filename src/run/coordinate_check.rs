@@ -1,5 +1,5 @@
-//! Detects models whose coordinates are not those of the photographs. Their renderings correlate with the photographs
-//! no more than by chance; even renderings of a poor model of the scene correlate better.
+//! Detects models whose coordinates are not those of the dataset. Renderings of such a model correlate with the
+//! photographs no more than by chance; even renderings of a poor model of the scene correlate better.
 
 use std::path::Path;
 
@@ -9,16 +9,16 @@ use densify_core::image::Image8;
 use densify_data::views::ViewSource;
 use densify_render::{Backend, Rendering};
 
-/// Maximum number of views compared, spread evenly over all.
+/// Maximum number of views that are compared, spread evenly over all views.
 const MAX_VIEWS: usize = 8;
-/// Correlation below which a model is refused. Models that were moved, mirrored, turned or scaled have −0.1 to 0.3,
-/// trained ones 0.88 to 0.99, and 0.97 after a thousand steps (room256, fox, office, chair, cup).
+/// Correlation below which a model is refused. It is −0.1 to 0.3 for models that were moved, mirrored, rotated or
+/// scaled, 0.88 to 0.99 for trained models, and 0.97 after a thousand steps (room256, fox, office, chair, cup).
 const REFUSED_BELOW: f64 = 0.1;
 /// Correlation below which the user is told that the model may be in other coordinates.
 const DOUBTED_BELOW: f64 = 0.35;
 /// Standard deviation of the sum of three channels in `[0, 1]` below which an image has too little contrast to compare.
 const CONTRAST: f64 = 0.02;
-/// Share of the pixels below which a model counts as not being in the view.
+/// Share of covered pixels below which a view counts as not showing the model.
 const MIN_COVERAGE: f64 = 1e-3;
 
 /// The correlation of a model's renderings with the photographs.
@@ -26,12 +26,12 @@ const MIN_COVERAGE: f64 = 1e-3;
 pub struct CoordinateCheck {
     /// Indices of the views to compare.
     views: Vec<usize>,
-    /// Their correlations; views in which the rendering or the photograph has only one colour are left out.
+    /// Correlations in these views, without views in which the rendering or the photograph has only one colour.
     correlations: Vec<f64>,
 }
 
 impl CoordinateCheck {
-    /// A check of renderings that are added one by one, of a model in a dataset with this number of views.
+    /// A check of a model in a dataset with this number of views; [`add`](Self::add) compares one view after another.
     pub fn new(views: usize) -> Self {
         let count = views.min(MAX_VIEWS);
         let views = (0..count).map(|place| place * views / count).collect();
@@ -69,7 +69,7 @@ impl CoordinateCheck {
         Ok(check)
     }
 
-    /// Mean over the views; `None` if no view could be compared.
+    /// The mean correlation over the views; `None` if no view could be compared.
     fn correlation(&self) -> Option<f64> {
         let (sum, count) = (self.correlations.iter().sum::<f64>(), self.correlations.len());
         (count > 0).then(|| sum / count as f64)
@@ -178,7 +178,7 @@ mod tests {
         (pixel * 7919 % 4093) as f32 / 4093.0
     }
 
-    fn compared(rendering: &Rendering, image: &Image8) -> Option<f64> {
+    fn compare_on_black(rendering: &Rendering, image: &Image8) -> Option<f64> {
         compare(rendering, image, [0.0; 3])
     }
 
@@ -188,7 +188,7 @@ mod tests {
         let shown = |pixel: usize| 0.3 + 0.4 * (pixel % SIZE) as f32 / SIZE as f32;
         let mirrored = |pixel: usize| shown(SIZE - 1 - pixel % SIZE);
         let correlation = |value: &dyn Fn(usize) -> f32| {
-            compared(&rendering(value, |_| 1.0), &photograph).expect("both have contrast")
+            compare_on_black(&rendering(value, |_| 1.0), &photograph).expect("both have contrast")
         };
         assert!(correlation(&shown) > 0.99);
         assert!(correlation(&mirrored) < -0.99);
@@ -201,11 +201,11 @@ mod tests {
         let is_part = |pixel: usize| pixel < 2 * SIZE;
         let part =
             rendering(|p| if is_part(p) { noise(p) } else { 0.0 }, |p| f32::from(is_part(p)));
-        assert!(compared(&part, &photograph).is_some_and(|value| value > 0.99));
-        assert_eq!(compared(&rendering(|_| 0.0, |_| 0.0), &photograph), Some(0.0));
+        assert!(compare_on_black(&part, &photograph).is_some_and(|value| value > 0.99));
+        assert_eq!(compare_on_black(&rendering(|_| 0.0, |_| 0.0), &photograph), Some(0.0));
         // An image of a single colour is no evidence.
-        assert_eq!(compared(&rendering(|_| 0.5, |_| 1.0), &photograph), None);
-        assert_eq!(compared(&rendering(noise, |_| 1.0), &image(|_| 99)), None);
+        assert_eq!(compare_on_black(&rendering(|_| 0.5, |_| 1.0), &photograph), None);
+        assert_eq!(compare_on_black(&rendering(noise, |_| 1.0), &image(|_| 99)), None);
     }
 
     #[test]
@@ -225,9 +225,9 @@ mod tests {
             let heard = Heard::default();
             let correlations = Vec::from_iter(correlation);
             let check = CoordinateCheck { views: vec![0], correlations };
-            let found = check.require(Some("init"), Path::new("m.ply"), &heard);
-            assert_eq!(found.is_err(), refused, "{correlation:?}");
-            let message = found.err().map_or_else(String::new, |failure| failure.to_string());
+            let result = check.require(Some("init"), Path::new("m.ply"), &heard);
+            assert_eq!(result.is_err(), refused, "{correlation:?}");
+            let message = result.err().map_or_else(String::new, |failure| failure.to_string());
             assert!(message.is_empty() || message.contains("coordinates"), "{message}");
             assert_eq!(heard.0.lock().expect("no panic").len(), notes, "{correlation:?}");
         }

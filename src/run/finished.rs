@@ -28,13 +28,13 @@ use densify_train::output::model_path;
 /// A device that renders models, and the threads that it may use.
 #[derive(Debug, Default)]
 pub struct Machine {
-    /// Processor threads; `None`: all.
+    /// Number of processor threads; `None`: all.
     threads: Option<usize>,
     device: Device,
 }
 
 impl Machine {
-    /// Opens the device that the options name.
+    /// Opens the device that the options name, or else the default one.
     pub fn open(spec: &DeviceSpec, observer: &dyn Observer) -> Result<Self, Failure> {
         let device = Device::open_to_render(spec.backend, spec.gpu.as_deref())?;
         observer.say(format_args!("{}", notes::device(observer.spelling(), &device)));
@@ -105,7 +105,7 @@ pub struct Opened {
     pub backend: Box<dyn Backend>,
 }
 
-/// Adds a remedy to a failure if the dataset is no longer at `path`, the path in the run's configuration.
+/// Adds a remedy to a failure if there is no dataset at `path`, the path in the run's configuration.
 pub fn or_moved(failure: Failure, path: &Path) -> Failure {
     if path.exists() || builtin::name(path).is_some() {
         failure
@@ -135,8 +135,8 @@ pub fn open_run(
         .map_err(|failure| if was_moved { failure } else { or_moved(failure, &path) })
 }
 
-/// Opens a model, written by any program, with a dataset. Without `near`, the near plane is the [usual one](NearPlane)
-/// of the dataset. Without `antialias`, the model is rendered as its file states.
+/// Opens a model, written by any program, with a dataset. Without `near`, the near plane is [chosen](NearPlane) for the
+/// dataset. Without `antialias`, the model is rendered as its file states.
 ///
 /// # Errors
 /// When the model, the dataset or the device cannot be opened.
@@ -243,14 +243,14 @@ impl Opened {
     ) -> Result<Option<Geometry>, Failure> {
         let Some(truth) = self.dataset.ground_truth()? else { return Ok(None) };
         let train = self.views(Split::Train)?;
-        let ground = KnownScene {
+        let scene = KnownScene {
             truth: &truth,
             normalisation: &self.dataset.normalisation,
             background: self.data.background.fixed(),
             sh_degree: self.sh_degree,
             is_stopped,
         };
-        Ok(Some(geometry::measure(self.backend.as_mut(), &ground, &train, views)?))
+        Ok(Some(geometry::measure(self.backend.as_mut(), &scene, &train, views)?))
     }
 
     /// The views of a split.

@@ -1,10 +1,10 @@
-//! Services that the caller of a run provides: an observer, and a way to measure the process's memory.
+//! Services that the caller of a run provides: an observer, a way to measure the process's memory, and a companion.
 
 use crate::companion::Companion;
 use crate::observer::{Observer, Silent};
 use crate::process::ProcessMemory;
 
-/// The surroundings of a run, which its caller provides.
+/// The services that the caller of a run provides.
 #[derive(Clone, Copy)]
 pub struct Host<'a> {
     /// Receives all messages and progress, and may stop the run.

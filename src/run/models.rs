@@ -1,4 +1,4 @@
-//! Files of models: single files, and those saved by a run.
+//! Model files: those that a run has saved, and files by any program.
 
 use std::borrow::Cow;
 use std::io::Write;
@@ -22,7 +22,7 @@ pub fn is_model(path: &Path) -> bool {
     (path.is_file() && !is_archive(path)) || path.join("meta.json").is_file()
 }
 
-/// The iteration asked for, or the last one saved.
+/// The iteration `asked` for, or else the last one that the run has saved.
 ///
 /// # Errors
 /// When the run has not saved that iteration, or has saved none.
@@ -106,8 +106,8 @@ pub fn model_file(named: &Path, asked: Option<u32>) -> Result<PathBuf, Failure> 
     }
 }
 
-/// Reads a file of Gaussian splats, written by any program, in its own coordinates, and tells the user about dropped
-/// and repaired rows, and the notes on the file.
+/// Reads a file of Gaussian splats, written by any program, in its own coordinates. Tells the user about rows that were
+/// dropped or repaired, and passes on the notes on the file.
 ///
 /// # Errors
 /// When it cannot be read.
@@ -115,7 +115,7 @@ pub fn read_model(path: &Path, observer: &dyn Observer) -> Result<Gaussians, Fai
     read_model_as(path, None, observer)
 }
 
-/// Reads a model as [`read_model`], with the antialiasing given instead of the one that the file states.
+/// Reads a model as [`read_model`] does, with the antialiasing `given` instead of the one that the file states.
 ///
 /// # Errors
 /// When it cannot be read.
@@ -125,12 +125,12 @@ pub fn read_model_as(
     observer: &dyn Observer,
 ) -> Result<Gaussians, Failure> {
     let mut file = models::read_model(path)?;
-    for (number, what) in [
+    for (number, problem) in [
         (file.dropped, "left out: a value is not finite"),
         (file.repaired, "with a zero quaternion, read as unrotated"),
     ] {
         if number > 0 {
-            observer.say(format_args!("note: {}: {number} rows {what}", path.display()));
+            observer.say(format_args!("note: {}: {number} rows {problem}", path.display()));
         }
     }
     for note in &file.notes {
@@ -142,7 +142,7 @@ pub fn read_model_as(
     Ok(file.gaussians)
 }
 
-/// Gives a model the antialiasing of the option; tells the user if its file states another.
+/// Gives a model the antialiasing of the option; tells the user if the model's file states another.
 pub(crate) fn override_antialiasing(
     model: &mut Gaussians,
     given: Antialiasing,
@@ -163,7 +163,7 @@ pub(crate) fn override_antialiasing(
 
 /// The model in the coordinates of the file to write, and their frame. Automatic coordinates are local if f32 is too
 /// coarse for world coordinates. A model that itself has only world coordinates in f32 keeps them in lossless formats.
-fn placed<'a>(
+fn in_coordinates_of_file<'a>(
     model: &'a Gaussians,
     coordinates: Coordinates,
     format: &Format,
@@ -215,13 +215,13 @@ pub fn write_model(
     coordinates: Coordinates,
     observer: &dyn Observer,
 ) -> Result<(), Failure> {
-    let (model, frame) = placed(model, coordinates, format, observer)?;
+    let (model, frame) = in_coordinates_of_file(model, coordinates, format, observer)?;
     write_in_frame(format, path, &model, frame, observer)?;
     say_unstated(format, path, frame, model.antialiasing, observer);
     Ok(())
 }
 
-/// Tells the user what a file does not state itself: a kernel of antialiasing, and the offset of local coordinates.
+/// Tells the user what a file cannot state itself: a kernel of antialiasing, or the offset of local coordinates.
 pub fn say_unstated(
     format: &Format,
     path: &Path,
@@ -244,7 +244,7 @@ pub fn say_unstated(
     }
 }
 
-/// Writes a model in another format, measured from the origin of the frame, and tells the observer what the format
+/// Writes a model in another format. The model must have its coordinates in `frame`. Tells the observer what the format
 /// changes. An error leaves an existing file as it is.
 ///
 /// # Errors

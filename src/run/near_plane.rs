@@ -1,4 +1,4 @@
-//! The near plane: as given by the user, or in front of nearly all points that the views show.
+//! The near plane: as the user gives it, or else in front of nearly all points that the views show.
 //!
 //! The extent of the cameras says nothing about the distance of the nearest surface: in a corridor of 120 m, 0.04 of
 //! the extent is 2.6 m, and the walls on both sides are nearer.
@@ -10,15 +10,15 @@ use densify_data::dataset::{Dataset, SeenDepths};
 use crate::failure::notes;
 use crate::spec::Fraction;
 
-/// The farthest near plane that is chosen `[fraction of the extent]`: the original's 0.2 for an extent of 5. With
-/// nearer planes, Gaussians become fog in front of single cameras: with 0.01, test views lost up to 10 dB to this fog.
+/// The farthest near plane that is chosen `[fraction of the extent]`: that of the original trainer, 0.2 at an extent of
+/// 5. With nearer planes, Gaussians become fog in front of single cameras: with 0.01, test views lost up to 10 dB.
 const FARTHEST: f64 = 0.04;
 /// The nearest near plane that is chosen `[fraction of the extent]`: the smallest size of a Gaussian made from a point.
 const NEAREST: f64 = 2e-4;
 /// The share of what the views show that may be nearer than the plane: reconstructions have stray points.
 const STRAY_SHARE: f64 = 0.005;
-/// The near plane as a fraction of the depth of the nearest points other than stray ones: points only sample the
-/// surfaces, and cameras of other views may be nearer to these surfaces.
+/// The near plane as a fraction of the depth of the nearest points, stray ones aside. It is below 1 because points only
+/// sample the surfaces, and because cameras of other views may be nearer to these surfaces.
 const DEPTH_FACTOR: f64 = 0.5;
 
 /// The near plane of a run, or of a model with the dataset that it is shown with.
@@ -26,7 +26,7 @@ const DEPTH_FACTOR: f64 = 0.5;
 pub struct NearPlane {
     /// Distance from the camera `[fraction of the extent]`.
     pub fraction: Fraction,
-    /// The user gave it.
+    /// The user gave this plane.
     is_given: bool,
     /// The share of what the views show that is nearer than this plane.
     hidden: f64,
@@ -35,7 +35,7 @@ pub struct NearPlane {
 }
 
 impl NearPlane {
-    /// The plane that is given, or one that follows from the points that the dataset's views show.
+    /// The plane that is given, or else one that follows from the points that the dataset's views show.
     pub fn choose(given: Option<Fraction>, dataset: &Dataset) -> Self {
         Self::from_depths(given, &dataset.seen_depths())
     }
@@ -55,7 +55,7 @@ impl NearPlane {
         }
     }
 
-    /// The distance from the camera `[scene units]`.
+    /// The distance of the plane from the camera `[scene units]`.
     pub fn distance(&self) -> f32 {
         Self::distance_of(self.fraction)
     }
@@ -65,7 +65,7 @@ impl NearPlane {
         (fraction.0 * EXTENT) as f32
     }
 
-    /// A line for the user if the chosen plane is nearer than usual, or the plane hides points.
+    /// A line for the user if the chosen plane is nearer than 0.04 of the extent, or if the plane hides points.
     pub fn line(&self, spelling: Spelling) -> Option<String> {
         let near = self.fraction.0;
         let percent = |share: f64| format!("{:.2} %", 100.0 * share);
@@ -95,7 +95,7 @@ pub(crate) mod tests {
 
     use super::*;
 
-    /// The depths seen by cameras that each see only one wall, at one of these depths.
+    /// The depths that cameras see if each camera faces a wall of its own, at one of these depths.
     pub(crate) fn walls(depths: &[f64]) -> SeenDepths {
         let at = |z: f64, i: usize| z * (2.0 * (i as f64 + 0.5) / 32.0 - 1.0);
         let mut points = Vec::new();

@@ -14,13 +14,13 @@ use crate::failure::notes;
 /// A signal that asks a run to end in an orderly way.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Interrupt {
-    /// Such as SIGINT.
+    /// Name of the signal, such as SIGINT.
     pub name: &'static str,
-    /// Exit code of a process that the signal ends.
+    /// Exit code of a process that the signal has ended.
     pub exit_code: u8,
 }
 
-/// What the run is to do next, as the observer decides between two steps.
+/// The observer's decision between two steps: what the run does next.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum NextAction {
     /// Continue with the next step.
@@ -46,7 +46,7 @@ pub trait Observer {
     /// A line of information for the user.
     fn say(&self, _line: fmt::Arguments<'_>) {}
 
-    /// Lines of detail, such as the table of memory: for users who ask for them.
+    /// Lines of detail, such as the table of memory, for users who ask for details.
     fn detail(&self, _lines: fmt::Arguments<'_>) {}
 
     /// Training begins after `done` steps and continues to step `last`, with at most `budget` rows.
@@ -55,7 +55,7 @@ pub trait Observer {
     /// A step is done.
     fn step(&self, _step: u32, _loss: f32, _rows: usize) {}
 
-    /// A record of the log, over the steps since the previous record.
+    /// A record was added to the log; it covers the steps since the previous record.
     fn recorded(&self, _record: &StepRecord) {}
 
     /// The rows were edited.
@@ -76,7 +76,7 @@ pub trait Observer {
     /// Training has ended or failed.
     fn end(&self) {}
 
-    /// The signal that asks the run to stop, if there is one. Called before every step.
+    /// The signal that asks the run to stop, if one was received. Called before every step.
     fn interrupt(&self) -> Option<Interrupt> {
         None
     }

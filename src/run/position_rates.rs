@@ -1,8 +1,8 @@
-//! The learning rates of positions where a view shows only a small part of the scene.
+//! The learning rates of positions in scenes of which each view shows only a small part.
 //!
 //! The default rates are fractions of the extent, chosen for cameras around an object, where the extent is about the
-//! distance of what a view shows. Along a route, the extent is the length of the route: such steps would throw
-//! Gaussians across everything that a view shows.
+//! distance of what a view shows. Along a route, the extent is the length of the route: steps in proportion to
+//! it would throw Gaussians across everything that a view shows.
 
 use densify_data::dataset::SeenDepths;
 use densify_data::dataset::normalise::EXTENT;
@@ -13,17 +13,17 @@ use crate::spec::RunSpec;
 /// 2 in scenes around an object or in a room, and 0.04 in a corridor of 120 m, where a third of the rates is best.
 const USUAL_DEPTH: f64 = 0.12;
 
-/// The factor of the default learning rates of positions.
+/// The reduction of the default learning rates of positions.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct PositionRates {
-    /// In (0, 1].
+    /// Factor of the rates, in (0, 1].
     pub(crate) factor: f64,
     /// The median depth of what the views show `[fraction of the extent]`.
     depth: f64,
 }
 
 impl PositionRates {
-    /// The factor for the points that the views show, unless `--lr` sets the rates.
+    /// The reduction that the points in the views call for; none if `--lr` sets the rates.
     pub(crate) fn choose(spec: &RunSpec, seen: &SeenDepths) -> Self {
         let is_given = spec.schedule.lr.iter().any(|rate| rate.path[..] == ["mean_start"]);
         let median = seen.quantile(0.5).filter(|_| !is_given);

@@ -18,12 +18,12 @@ pub struct ProcessMemory {
     pub resident: fn() -> Option<u64>,
     /// Peak resident memory so far `[bytes]`.
     pub peak: fn() -> Option<u64>,
-    /// The tightest limit for a process with this many busy threads.
+    /// The tightest limit on the memory of a process with this many busy threads.
     pub grant: fn(usize) -> Option<MemoryLimit>,
 }
 
 impl ProcessMemory {
-    /// As the operating system reports it (Linux).
+    /// Reports what the operating system reports (on Linux).
     pub const SYSTEM: Self = Self { resident, peak: peak_resident, grant };
     /// Reports nothing, so that no run is refused for lack of memory.
     pub const UNKNOWN: Self = Self { resident: || None, peak: || None, grant: |_| None };
@@ -35,19 +35,19 @@ pub struct MemoryLimit {
     /// Memory that the process can still obtain `[bytes]`.
     pub left: u64,
     /// Name of the limit, for messages.
-    pub by: &'static str,
+    pub name: &'static str,
 }
 
-/// The tightest limit that the system sets (Linux). Runs that need more are refused before they start, as a failed
-/// allocation would abort the process without a message.
+/// The tightest memory limit that the system sets (on Linux). Runs that need more are refused before they start,
+/// because a failed allocation would abort the process without a message.
 pub fn grant(threads: usize) -> Option<MemoryLimit> {
     let grants = [
         address_space(threads)
-            .map(|left| MemoryLimit { left, by: "the limit of its address space (ulimit -v)" }),
+            .map(|left| MemoryLimit { left, name: "the limit of its address space (ulimit -v)" }),
         control_group()
-            .map(|left| MemoryLimit { left, by: "the memory limit of its control group" }),
+            .map(|left| MemoryLimit { left, name: "the memory limit of its control group" }),
         available()
-            .map(|left| MemoryLimit { left, by: "the memory that the system has available" }),
+            .map(|left| MemoryLimit { left, name: "the memory that the system has available" }),
     ];
     grants.into_iter().flatten().min_by_key(|grant| grant.left)
 }
@@ -66,7 +66,7 @@ fn parse_limit(limits: &str) -> Option<u64> {
     line.split_whitespace().next()?.parse().ok()
 }
 
-/// Control groups, version 2. In a container, the group of the container is the visible root.
+/// Memory left to the control group (version 2). In a container, the container's group is the visible root.
 fn control_group() -> Option<u64> {
     let groups = read_to_string("/proc/self/cgroup").ok()?;
     let group = groups.lines().find_map(|line| line.strip_prefix("0::/"))?;
@@ -85,7 +85,7 @@ fn group_left(max: &str, current: &str, stat: &str) -> Option<u64> {
     Some(max.saturating_sub(current.saturating_sub(cached)))
 }
 
-/// `/proc/meminfo` has the format of `/proc/self/status`.
+/// Memory that the system has available, swap included. `/proc/meminfo` has the format of `/proc/self/status`.
 fn available() -> Option<u64> {
     let memory = read_to_string("/proc/meminfo").ok()?;
     let free = parse_status(&memory, "MemAvailable:")?;
@@ -97,7 +97,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn limits_are_read() {
+    fn the_soft_limit_of_the_address_space_is_read() {
         let limits = |soft: &str| {
             format!(
                 "Limit                     Soft Limit           Hard Limit           Units     \n\

@@ -32,7 +32,7 @@ pub struct ViewScore {
     pub ssim: f64,
     /// FLIP error.
     pub flip: f64,
-    /// LPIPS, if its weights are available.
+    /// LPIPS; `None` if its weights are not available.
     pub lpips: Option<f64>,
     /// Scores of the rendering with the exposure that fits the photograph best, if requested.
     pub fitted: Option<FittedScore>,
@@ -50,7 +50,7 @@ pub struct Mean {
     /// FLIP error: visible difference, 0 for equal images.
     #[serde(rename = "FLIP")]
     pub flip: f64,
-    /// LPIPS: distance of network features, 0 for equal images; if its weights were available.
+    /// LPIPS: distance between network features, 0 for equal images; `None` if its weights were not available.
     #[serde(rename = "LPIPS", default, skip_serializing_if = "Option::is_none")]
     pub lpips: Option<f64>,
     /// Mean scores of the renderings with the exposures that fit the photographs best, if requested.

@@ -7,7 +7,7 @@ use densify_core::gaussians::{Gaussians, sigmoid};
 use densify_data::views::ViewSource;
 use densify_render::{AuxInput, Backend, BackendError};
 
-/// The values that the backend for [`importance`] must record; pass them when creating it.
+/// The values that the backend for [`importance`] must record; pass them when creating the backend.
 pub fn needs() -> Needs {
     Needs { aux: Some(request()), ..Needs::default() }
 }
@@ -16,9 +16,9 @@ fn request() -> AuxRequest {
     AuxRequest { map: PixelMap::default(), columns: vec![AuxColumn::WeightSum], points: 0 }
 }
 
-/// Memory for [`importance`] in addition to the backend and an image `[bytes]`.
+/// Memory that [`importance`] needs in addition to the backend and one image `[bytes]`.
 pub fn bytes(rows: usize) -> u64 {
-    // Per row: its weight in a view, its sum, and its place in the order.
+    // Per row: its weight in one view, the sum over all views, and its index while sorting.
     rows as u64 * (size_of::<f32>() + size_of::<f64>() + size_of::<usize>()) as u64
 }
 
@@ -50,18 +50,18 @@ pub fn importance(
             sh_degree,
             request: &request,
         };
-        let seen = backend.observe(&input);
-        let seen =
-            seen.map_err(|source: BackendError| EvaluateError::Backend { view: name(), source })?;
-        for (sum, weight) in sums.iter_mut().zip(&seen.columns[0].1) {
+        let output = backend.observe(&input);
+        let output = output
+            .map_err(|source: BackendError| EvaluateError::Backend { view: name(), source })?;
+        for (sum, weight) in sums.iter_mut().zip(&output.columns[0].1) {
             *sum += f64::from(*weight);
         }
     }
     Ok(sums)
 }
 
-/// A substitute for importance if there are no views: the logarithm of each row's largest possible contribution to an
-/// image, which is its opacity times its two longest axes. Shape: `[rows]`.
+/// A substitute for importance if there are no views: the logarithm of the product of each row's opacity and its two
+/// longest axes, which measures its largest possible contribution to an image. Shape: `[rows]`.
 pub fn footprints(model: &Gaussians) -> Vec<f64> {
     let footprint = |row: usize| {
         let mut log_scales = model.log_scales[row];
@@ -85,7 +85,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_largest_values_keep_their_order() {
+    fn the_most_important_rows_are_in_ascending_order() {
         assert_eq!(largest(&[1.0, 3.0, 0.0, 3.0, 2.0], 3), [1, 3, 4]);
         assert_eq!(largest(&[1.0, 1.0, 1.0], 2), [0, 1]);
         assert_eq!(largest(&[1.0], 5), [0]);

@@ -31,17 +31,17 @@ pub fn photograph(image: &Image8, background: [f32; 3]) -> RgbImage {
     RgbImage::from_fn(image.width, image.height, pixel)
 }
 
-/// Images from left to right, with white gaps `[px]` between them.
+/// Joins images from left to right, with white gaps of width `gap` `[px]` between them.
 pub fn side_by_side(pictures: &[RgbImage], gap: u32) -> RgbImage {
     let width = pictures.iter().map(|picture| picture.width() + gap).sum::<u32>() - gap;
     let height = pictures.iter().map(RgbImage::height).max().unwrap_or(1);
-    let mut all = RgbImage::from_pixel(width, height, Rgb([255; 3]));
+    let mut joined = RgbImage::from_pixel(width, height, Rgb([255; 3]));
     let mut x = 0;
     for picture in pictures {
-        imageops::replace(&mut all, picture, i64::from(x), 0);
+        imageops::replace(&mut joined, picture, i64::from(x), 0);
         x += picture.width() + gap;
     }
-    all
+    joined
 }
 
 /// Writes an image as a PNG file.

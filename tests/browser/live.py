@@ -37,7 +37,7 @@ def check(browser: Browser, url: str, run: Path, folder: Path | None) -> None:
     assert browser.run(PROBE)["spread"] > 4, "the picture is empty"
     browser.screenshot(folder, "live")
 
-    # A hidden page requests no pictures, so it does not slow training down; shown again, it is updated.
+    # A hidden page requests no pictures, so it does not slow training down; when it is shown again, it is updated.
     hide = "Object.defineProperty(document, 'hidden', { configurable: true, value: true });"
     notify = "document.dispatchEvent(new Event('visibilitychange'));"
     browser.run(hide + notify)

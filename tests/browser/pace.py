@@ -27,18 +27,18 @@ def measure(browser: Browser, url: str, rounds: int) -> None:
     rows = browser.run("return scene.models[0].rows")
     shown = browser.run("return document.getElementById('stage').dataset.size")
     print(f"{rows} Gaussians, {shown} at rest")
-    rounds_found = []
+    results = []
     for number in range(rounds):
         turned = browser.run_async(TURN, SECONDS)
         browser.wait_until_sharp()
         sharp_after, status = browser.run(
             "return [Number(stage.dataset.rested), document.getElementById('status').textContent]"
         )
-        rounds_found.append((turned["rate"], turned["reported"], mean(turned["widths"]), sharp_after))
-        rate, reported, width, sharp_after = rounds_found[-1]
+        results.append((turned["rate"], turned["reported"], mean(turned["widths"]), sharp_after))
+        rate, reported, width, sharp_after = results[-1]
         print(f"round {number}: {rate:.1f} pictures/s (the page reports {reported:.1f}), {width:.0f} px wide on average; "
               f"sharp {sharp_after:.0f} ms after the last movement ({status})")
-    rate, reported, width, sharp_after = (median(column) for column in zip(*rounds_found))
+    rate, reported, width, sharp_after = (median(column) for column in zip(*results))
     print(f"median: {rate:.1f} pictures/s (the page reports {reported:.1f}), {width:.0f} px wide, sharp after {sharp_after:.0f} ms")
 
 

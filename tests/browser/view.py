@@ -83,7 +83,7 @@ const [width, height] = area();
 const [x, y] = places.find(([x, y, z]) => z > 0 && x > 20 && y > 60 && x < width - 120 && y < height - 60).map(Math.round);
 return [x, y, cameraAt(x, y)];
 """
-# Visible controls that the keyboard does not reach, or that have no name.
+# Visible controls that cannot be reached with the keyboard, or that have no name.
 UNREACHABLE = """
 const seen = [...document.querySelectorAll("button, select, input, summary, [tabindex]")]
   .filter((it) => it.offsetParent !== null && !it.disabled && (it.type !== "radio" || it.checked));
@@ -335,20 +335,20 @@ def check(browser: Browser, url: str, densify: str, run: str, rendered: Path, fo
     browser.run(MIDDLE_PSNR)
     browser.run("orbit(0, 0)")
     browser.wait_until_sharp()
-    near = browser.run(MIDDLE_PSNR)
-    assert near >= 38, f"the picture has a PSNR of {near:.1f} dB to that before leaving the camera"
+    psnr = browser.run(MIDDLE_PSNR)
+    assert psnr >= 38, f"the picture has a PSNR of {psnr:.1f} dB to that before leaving the camera"
     browser.choose("view", "test:0")
     browser.choose("left", "photograph:0")
     browser.choose("right", "render:0")
     # Photograph and render are shown at the photograph's size.
-    own = browser.run("const { width, height } = scene.views.test[0]; return `${width}x${height}`")
+    expected = browser.run("const { width, height } = scene.views.test[0]; return `${width}x${height}`")
     found = browser.run("return document.getElementById('stage').dataset.size")
-    assert found == own, f"{found} instead of {own}"
+    assert found == expected, f"{found} instead of {expected}"
     # The picture is that of `densify render`.
     name = Path(browser.run("return scene.views.test[0].name")).with_suffix(".png")
     png = base64.b64encode((rendered / "pictures" / name).read_bytes()).decode()
-    near = browser.run_async(PSNR, f"data:image/png;base64,{png}")
-    assert near >= 38, f"the picture has a PSNR of {near:.1f} dB to that of densify render"
+    psnr = browser.run_async(PSNR, f"data:image/png;base64,{png}")
+    assert psnr >= 38, f"the picture has a PSNR of {psnr:.1f} dB to that of densify render"
     before = browser.run(PROBE)
     browser.run("document.getElementById('divider').focus()")
     browser.press("\ue011")  # Home
@@ -453,8 +453,8 @@ def check(browser: Browser, url: str, densify: str, run: str, rendered: Path, fo
     browser.run("setOnPath(0.5); view = null; changed()")
     browser.wait_until_sharp()
     png = base64.b64encode((rendered / "thirds" / "frame_00001.png").read_bytes()).decode()
-    near = browser.run_async(PSNR.replace("shown[1]", "shown[0]"), f"data:image/png;base64,{png}")
-    assert near >= 36, f"half-way along the path, the page has a PSNR of {near:.1f} dB to densify"
+    psnr = browser.run_async(PSNR.replace("shown[1]", "shown[0]"), f"data:image/png;base64,{png}")
+    assert psnr >= 36, f"half-way along the path, the page has a PSNR of {psnr:.1f} dB to densify"
     browser.run("document.getElementById('remove').click()")
     assert browser.run("return keys.length") == 1, "the last camera is not removed"
 
@@ -520,7 +520,7 @@ def check_slow_network(browser: Browser, url: str) -> None:
 
 
 def check_two_runs(browser: Browser, url: str, folder: Path | None) -> None:
-    """Two runs, shown from one camera, with a border between them."""
+    """Checks the page of two runs, which shows both from one camera with a border between them."""
 
     def halves() -> list[str]:
         lights = []
@@ -567,7 +567,7 @@ def check_two_runs(browser: Browser, url: str, folder: Path | None) -> None:
 
 
 def check_logs(browser: Browser, url: str) -> None:
-    """The log has no errors or warnings, and all requests went to the page's server."""
+    """Checks that the log has no errors or warnings, and that all requests went to the page's server."""
     severe = [entry["message"] for entry in browser.log("browser") if entry["level"] in ("SEVERE", "WARNING")]
     assert not severe, "\n".join(severe)
     events = [json.loads(entry["message"])["message"] for entry in browser.log("performance")]

@@ -4,8 +4,8 @@
 
 splat-transform (node) reads each export. The number of rows, the values up to the format's precision, and the bounds
 must be those of the PLY. Its rendering of the export must be close to its rendering of the PLY, which must be close to
-densify's. It does not read glTF: Khronos' validator checks the GLB, and its accessors are read here. The pictures need
-Pillow, and a Vulkan driver for Dawn.
+densify's. As splat-transform does not read glTF, Khronos' validator checks the GLB, whose accessors are read here. The
+pictures need Pillow, and a Vulkan driver for Dawn.
 """
 
 import json
@@ -45,11 +45,11 @@ def bounds(found: list[Row]) -> list[float]:
     return [limit(row[axis] for row in found) for axis in "xyz" for limit in (min, max)]
 
 
-def compare(truth: list[Row], found: list[Row], what: str) -> None:
+def compare(truth: list[Row], found: list[Row], label: str) -> None:
     """Allows for the precision of the coarsest format, and for its palette of coefficients."""
-    assert len(truth) == len(found), f"{what}: {len(found)} rows"
+    assert len(truth) == len(found), f"{label}: {len(found)} rows"
     distance = max(abs(a - b) for a, b in zip(bounds(truth), bounds(found)))
-    assert distance < 0.003, f"{what}: the bounds differ by {distance}"
+    assert distance < 0.003, f"{label}: the bounds differ by {distance}"
     # A sample of about a hundred rows, since each is searched for in all rows. Rows with an opacity of 0 in a byte are
     # excluded, since writers drop their other values.
     visible = [row for row in truth if opacity(row) > 0.004]
@@ -59,14 +59,14 @@ def compare(truth: list[Row], found: list[Row], what: str) -> None:
         nearest = sorted(found, key=distance)[:32]
         compared = ["opacity", *(f"{name}_{k}" for name in ("f_dc", "scale") for k in range(3))]
         other = min(nearest, key=lambda other: 100 * distance(other) + sum(abs(row[k] - other[k]) for k in compared))
-        assert distance(other) < 0.003, f"{what}: positions differ by {distance(other)}"
-        assert abs(opacity(row) - opacity(other)) < 0.004, f"{what}: opacity"
+        assert distance(other) < 0.003, f"{label}: positions differ by {distance(other)}"
+        assert abs(opacity(row) - opacity(other)) < 0.004, f"{label}: opacity"
         for name, limit in [("scale_", 0.1), ("f_dc_", 0.06), ("f_rest_", 0.7)]:
             for key in (key for key in row if key.startswith(name)):
-                assert abs(row[key] - other[key]) < limit, f"{what}: {key} {row[key]} {other[key]}"
+                assert abs(row[key] - other[key]) < limit, f"{label}: {key} {row[key]} {other[key]}"
         q, p = ([r[f"rot_{i}"] for i in range(4)] for r in (row, other))
         cosine = abs(sum(a * b for a, b in zip(q, p))) / math.hypot(*q) / math.hypot(*p)
-        assert cosine > 0.9998, f"{what}: rotations differ"
+        assert cosine > 0.9998, f"{label}: rotations differ"
 
 
 def psnr(a: Path, b: Path) -> float:

@@ -12,7 +12,7 @@ use densify_policies::policy::{
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use crate::subject::{GREY, RATES, make, make_with, others, step_input, wide};
+use crate::subject::{BLUE, RATES, make, make_with, others, step_input, wide};
 
 #[test]
 fn loss_and_gradient_match_the_native_backend() {
@@ -38,8 +38,8 @@ fn loss_and_gradient_match_the_native_backend() {
                 let rgb: Vec<f32> = target.rgb.iter().enumerate().map(&mut value).collect();
                 let rendering = scenes::opaque(&rgb, &target);
                 let (expected, expected_gradient) =
-                    native.loss(&rendering, &target, GREY).expect("a loss");
-                let (found, gradient) = backend.loss(&rendering, &target, GREY).expect("a loss");
+                    native.loss(&rendering, &target, BLUE).expect("a loss");
+                let (found, gradient) = backend.loss(&rendering, &target, BLUE).expect("a loss");
                 let case = format!("{width}x{height}, alpha {with_alpha}, mask {with_mask}");
                 for (name, found, expected) in [
                     ("loss", found.loss, expected.loss),
@@ -107,11 +107,11 @@ fn compare_models(table: &mut Table, case: &str, found: &Gaussians, expected: &G
         assert_eq!(found.len(), expected.len(), "{case}: {class}");
         // Where a gradient is only rounding error, Adam's first steps may go a full step either way. Few entries
         // are affected.
-        let off = found.iter().zip(expected).filter(|(a, b)| {
+        let differing = found.iter().zip(expected).filter(|(a, b)| {
             let difference = (**a - **b).abs();
             difference.is_nan() || difference > 0.02 * rate + 1e-6 * b.abs()
         });
-        let share = off.count() as f64 / expected.len().max(1) as f64;
+        let share = differing.count() as f64 / expected.len().max(1) as f64;
         table.check(case, class, share, 0.01);
     }
 }
@@ -165,8 +165,8 @@ fn training_steps_match_the_native_backend() {
                 }
                 let expected = step(&mut *native, &camera, n, needs, *cadence);
                 let found = step(&mut *backend, &camera, n, needs, *cadence);
-                let off = f64::from((found.loss - expected.loss).abs());
-                table.check(case, "loss", off, 1e-4);
+                let error = f64::from((found.loss - expected.loss).abs());
+                table.check(case, "loss", error, 1e-4);
                 assert_eq!(found.visible, expected.visible, "{case}, step {n}");
                 let entries = (found.entries as f64 / expected.entries as f64 - 1.0).abs();
                 table.check(case, "entries", entries, 0.02);

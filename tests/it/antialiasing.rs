@@ -1,4 +1,4 @@
-//! Models trained with antialiasing: what files of other programs state, and how it is rendered, on every backend.
+//! Models trained with antialiasing: the kind that files of other programs state, and its rendering on every backend.
 
 use std::path::Path;
 

@@ -47,7 +47,7 @@ fn request(map: PixelMap) -> AuxRequest {
     AuxRequest { map, columns: AuxColumn::ALL.to_vec(), points: 0 }
 }
 
-/// `cap` limits the entries of the tile lists; gradient records are limited to half of `cap`.
+/// Creates a backend. `cap` limits the entries of its tile lists; gradient records are limited to half of `cap`.
 fn backend(
     subject: &Subject,
     scene: &Scene,

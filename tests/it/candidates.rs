@@ -108,21 +108,21 @@ fn gradient_mode_ignores_a_constant_colour_offset() {
     // The target is the model's own rendering, except for a patch that is brighter by 0.25 and a strip with a
     // ±0.03 checkerboard that the model lacks.
     let model = plane(2.0);
-    let own = rendered(&model);
+    let rendering = rendered(&model);
     let side = SIDE as usize;
     let target = image(|i| {
         let (x, y) = (i / 3 % side, i / 3 / side);
         let [left, top, right, bottom] = PATCH;
         let (fx, fy) = (x as f64 + 0.5, y as f64 + 0.5);
         let in_patch = (left..right).contains(&fx) && (top..bottom).contains(&fy);
-        let weave = if x >= FINE {
+        let checkerboard = if x >= FINE {
             0.0
         } else if (x / 2 + y / 2) % 2 == 0 {
             0.03
         } else {
             -0.03
         };
-        own.rgb[i] + weave + if in_patch { 0.25 } else { 0.0 }
+        rendering.rgb[i] + checkerboard + if in_patch { 0.25 } else { 0.0 }
     });
     let share = |subject: &Subject, mode: ErrorMode| {
         let found = candidates(subject, &model, &target, request(mode, 0.5));
@@ -158,7 +158,7 @@ fn candidates_require_the_minimum_alpha() {
             *value = logit(0.1);
         }
     }
-    let own = rendered(&model);
+    let rendering = rendered(&model);
     let side = SIDE as usize;
     let white = image(|i| if i / 3 % side > 52 { 1.0 } else { 0.6 });
     for (subject, mode) in repeatable().iter().flat_map(|s| MODES.map(|mode| (s, mode))) {
@@ -168,7 +168,7 @@ fn candidates_require_the_minimum_alpha() {
             let found = candidates(subject, &model, &white, request);
             let alpha = |c: &Candidate| {
                 let p = pixel(c);
-                own.alpha[p.y as usize * SIDE as usize + p.x as usize]
+                rendering.alpha[p.y as usize * SIDE as usize + p.x as usize]
             };
             (found.len(), found.iter().filter(|c| alpha(c) < 0.5).count())
         };
@@ -213,9 +213,9 @@ fn numbers(points: &[Candidate]) -> Vec<f32> {
 }
 
 /// Checks that most points match. Where two pixels have nearly equal errors, either may be chosen.
-fn compare_points(table: &mut Table, what: &str, found: &[Candidate], expected: &[Candidate]) {
+fn compare_points(table: &mut Table, case: &str, found: &[Candidate], expected: &[Candidate]) {
     if found.is_empty() || found.len().abs_diff(expected.len()) > 1 + expected.len() / 50 {
-        table.fail(format!("{what}: {} points, not {}", found.len(), expected.len()));
+        table.fail(format!("{case}: {} points, not {}", found.len(), expected.len()));
         return;
     }
     let near = |a: &Candidate, b: &Candidate| {
@@ -225,7 +225,7 @@ fn compare_points(table: &mut Table, what: &str, found: &[Candidate], expected: 
             .all(|(a, b)| (a - b).abs() < 2e-3 * (1.0 + b.abs()))
     };
     let missing = found.iter().filter(|a| !expected.iter().any(|b| near(a, b))).count();
-    table.check(what, "points", missing as f64 / found.len() as f64, 0.04);
+    table.check(case, "points", missing as f64 / found.len() as f64, 0.04);
 }
 
 #[test]

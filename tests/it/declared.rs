@@ -82,8 +82,8 @@ fn noise_has_the_declared_covariance() {
         };
         let moved = run(subject, 3);
         if let Subject::Native { instructions, .. } = *subject {
-            let alone = Subject::Native { instructions, threads: Some(1) };
-            assert!(moved == run(&alone, 3), "noise depends on the threads");
+            let single_threaded = Subject::Native { instructions, threads: Some(1) };
+            assert!(moved == run(&single_threaded, 3), "noise depends on the threads");
         }
         assert!(moved.means != run(subject, 4).means, "noise does not depend on the step");
         assert_eq!((&moved.log_scales, &moved.sh), (&model.log_scales, &model.sh));
@@ -296,8 +296,8 @@ fn masks_follow_their_gradient_and_hide_gaussians() {
                 let second_hat = *second / (1.0 - 0.999_f64.powi(age));
                 *m -= 0.02 * first_hat / second_hat.sqrt();
                 // The tolerance is a hundredth of a step.
-                let off = (found[row] - sigmoid(*m)).abs();
-                assert!(off < 0.01 * 0.02, "step {number}, row {row}: {} {m}", found[row]);
+                let error = (found[row] - sigmoid(*m)).abs();
+                assert!(error < 0.01 * 0.02, "step {number}, row {row}: {} {m}", found[row]);
                 let is_transparent = after.opacity_logits[row] < -9.0;
                 let is_close = (sigmoid(*m) - 0.72).abs() < 1e-4;
                 assert!(is_close || is_transparent == (sigmoid(*m) <= 0.72), "row {row}: {m}");

@@ -257,10 +257,10 @@ fn missing(tree: &Tree, document: &str, text: &str) -> Vec<String> {
 #[test]
 fn names_in_documents_exist() {
     let tree = Tree::of_project();
-    let found = tree.documents();
-    assert!(found.iter().any(|(path, _)| *path == "docs/data.md"), "the search finds too little");
+    let documents = tree.documents();
+    assert!(documents.iter().any(|(path, _)| *path == "docs/data.md"), "docs/data.md is missing");
     let missing: Vec<String> =
-        found.iter().flat_map(|(path, text)| missing(&tree, path, text)).collect();
+        documents.iter().flat_map(|(path, text)| missing(&tree, path, text)).collect();
     assert!(missing.is_empty(), "these do not exist: {missing:#?}");
 }
 

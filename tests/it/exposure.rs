@@ -13,7 +13,7 @@ use densify::selftest::{Setup, Subject, scenes};
 use densify_policies::policy::{AuxColumn, AuxRequest, Candidate, CandidateRequest, DepthMode};
 use densify_policies::policy::{ErrorMode, Needs};
 
-use crate::subject::{GREY, all, make_with, normalised, repeatable, step_input};
+use crate::subject::{BLUE, all, make_with, normalised, repeatable, step_input};
 
 /// Step of the central difference, to either side.
 const STEP: f64 = 1e-6;
@@ -49,7 +49,7 @@ impl Scene {
     /// The photograph composited on the background.
     fn truth(&self) -> Vec<f64> {
         let (width, height) = self.size();
-        let at = |pixel: usize| self.target.composited(pixel % width, pixel / width, GREY);
+        let at = |pixel: usize| self.target.composited(pixel % width, pixel / width, BLUE);
         (0..width * height).flat_map(at).map(f64::from).collect()
     }
 
@@ -59,7 +59,7 @@ impl Scene {
             std::array::from_fn(|i| {
                 let row = &exposure[3 * i..3 * i + 3];
                 let mixed: f64 = row.iter().zip(colour).map(|(m, c)| m * c).sum();
-                mixed + alpha * exposure[9 + i] + (1.0 - alpha) * f64::from(GREY[i])
+                mixed + alpha * exposure[9 + i] + (1.0 - alpha) * f64::from(BLUE[i])
             })
         };
         foreground.as_chunks::<3>().0.iter().zip(alpha).flat_map(pixel).collect()
@@ -123,27 +123,27 @@ fn gradients_match_the_reference_and_central_differences() {
             })
             .collect();
         // Chain rule to the colours and alpha of the foreground.
-        let by_shown = compared(&at).gradient;
-        let by_shown = by_shown.as_chunks::<3>().0;
-        let rgb = by_shown.iter().flat_map(|g| -> [f64; 3] {
+        let pixel_gradient = compared(&at).gradient;
+        let pixel_gradient = pixel_gradient.as_chunks::<3>().0;
+        let rgb = pixel_gradient.iter().flat_map(|g| -> [f64; 3] {
             std::array::from_fn(|j| (0..3).map(|i| at[3 * i + j] * g[i]).sum())
         });
-        let alpha = by_shown
+        let alpha = pixel_gradient
             .iter()
-            .map(|g| -> f64 { (0..3).map(|i| g[i] * (at[9 + i] - f64::from(GREY[i]))).sum() });
+            .map(|g| -> f64 { (0..3).map(|i| g[i] * (at[9 + i] - f64::from(BLUE[i]))).sum() });
         let upstream = Upstream {
             rgb: rgb.collect(),
             alpha: alpha.collect(),
             depth: vec![0.0; width * height],
         };
-        let (_, by_row) = differentiate(&model, scene.view(), &Rules::STANDARD, &upstream);
-        let by_row = by_row.model;
+        let (_, exact) = differentiate(&model, scene.view(), &Rules::STANDARD, &upstream);
+        let exact = exact.model;
         for subject in all() {
             let mut backend = backend(&subject, &scene);
             let output = step(&mut *backend, &scene, Some(&EXPOSURE));
             let case = format!("{}, alpha {with_alpha}", subject.name());
-            let off = (f64::from(output.loss) - compared(&at).loss).abs();
-            table.check(&case, "loss", off, 1e-5);
+            let error = (f64::from(output.loss) - compared(&at).loss).abs();
+            table.check(&case, "loss", error, 1e-5);
             let found = output.exposure.expect("a gradient");
             let found: Vec<f32> = found.matrix.concat().into_iter().chain(found.offset).collect();
             let tolerance = 10.0 * subject.gradient_tolerance();
@@ -157,7 +157,7 @@ fn gradients_match_the_reference_and_central_differences() {
                 ("log_scales", class(3, 3)),
                 ("opacity_logits", class(10, 1)),
             ] {
-                table.check(&case, name, relative_error(&found, by_row.class(name)), tolerance);
+                table.check(&case, name, relative_error(&found, exact.class(name)), tolerance);
             }
         }
     }
@@ -226,20 +226,20 @@ fn auxiliary_views_and_candidates_apply_the_exposure() {
             ..Setup::default()
         };
         let mut backend = make_with(&subject, &scene.model, setup);
-        let seen = backend.observe(&AuxInput {
+        let observed = backend.observe(&AuxInput {
             step: 1,
             view: 0,
             seed: 3,
             camera: &scene.camera,
             target: &scene.target,
-            background: GREY,
+            background: BLUE,
             exposure: Some(&EXPOSURE),
             sh_degree: 1,
             request: &request,
         });
-        let seen = seen.expect("a small image is rendered");
+        let observed = observed.expect("a small image is rendered");
         let output = step(&mut *backend, &scene, Some(&EXPOSURE));
-        assert!((seen.loss - output.loss).abs() < 1e-6, "{}", subject.name());
+        assert!((observed.loss - output.loss).abs() < 1e-6, "{}", subject.name());
         let grey = EXPOSURE.inverse().apply([128.0 / 255.0; 3]);
         let list: &[Candidate] = backend.candidates();
         assert!(!list.is_empty(), "{}", subject.name());

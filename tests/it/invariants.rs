@@ -144,16 +144,16 @@ fn packages_depend_only_on_lower_layers() {
 
 #[test]
 fn lower_layers_do_not_depend_on_excluded_crates() {
-    for (leaf, forbidden) in [
+    for (folder, forbidden) in [
         ("policies", &["wgpu", "image", "rayon"][..]),
         ("scenegen", &["wgpu"]),
         ("src/core", &["wgpu", "image", "rayon", "clap"]),
         ("src/data", &["wgpu"]),
         ("src/render", &["image", "gltf"]),
     ] {
-        let found = dependencies(leaf);
+        let found = dependencies(folder);
         let bad = found.iter().find(|name| forbidden.contains(&name.as_str()));
-        assert!(bad.is_none(), "{leaf} names {bad:?}");
+        assert!(bad.is_none(), "{folder} names {bad:?}");
     }
 }
 

@@ -99,8 +99,8 @@ fn shots() -> &'static [Shot] {
         let mut backend = make(&Subject::NATIVE, &blobs());
         let shoot = |view: usize| {
             let camera = camera(view);
-            let seen = backend.render(&camera, [0.0; 3], 0).expect("a small image is rendered");
-            Shot { camera, rgb: seen.rgb, alpha: seen.alpha }
+            let image = backend.render(&camera, [0.0; 3], 0).expect("a small image is rendered");
+            Shot { camera, rgb: image.rgb, alpha: image.alpha }
         };
         (0..VIEWS).map(shoot).collect()
     })
@@ -130,7 +130,7 @@ impl Photographs {
         Self::colmap_text_at(DVec3::ZERO)
     }
 
-    /// The same with its origin at a place in the world.
+    /// The same model, shifted by `place`.
     pub(crate) fn colmap_text_at(place: DVec3) -> Self {
         let made = Self::with_images();
         let (width, height) = SIZE;

@@ -17,7 +17,7 @@ use crate::photographs::Photographs;
 use crate::subject::{devices, make_with, saved, storages};
 
 const ROWS: usize = 60;
-/// The PSNR is measured at steps 100 and 200, at step 200 also with the rows of lowest weight hidden.
+/// The PSNR is measured at steps 100 and 200; at step 200 it is also measured with the rows of lowest weight hidden.
 const ITERATIONS: u32 = 250;
 const MEASURED_AT: u32 = 200;
 
@@ -41,7 +41,7 @@ fn needs() -> Needs {
 }
 
 /// The state of a run after [`MEASURED_AT`] steps with or without measurements.
-fn bits(backend: Box<dyn Backend>, dataset: &Dataset, measures: bool) -> (Gaussians, Vec<Tensor>) {
+fn state(backend: Box<dyn Backend>, dataset: &Dataset, measures: bool) -> (Gaussians, Vec<Tensor>) {
     let scene = SceneInfo {
         extent: 1.0,
         train_views: dataset.train.len() as u32,
@@ -86,7 +86,7 @@ fn measuring_does_not_change_the_run() {
     for (subject, storage) in stored.into_iter().chain(device) {
         let [without, with] = [false, true].map(|measures| {
             let setup = Setup { storage, needs: needs(), ..Setup::default() };
-            bits(make_with(&subject, &model, setup), &dataset, measures)
+            state(make_with(&subject, &model, setup), &dataset, measures)
         });
         assert!(with == without, "{}, {storage:?}", subject.name());
     }

@@ -9,10 +9,10 @@ use densify::selftest::{Setup, Subject, scenes};
 use proptest::prelude::*;
 use proptest::test_runner::{TestCaseResult, TestRunner};
 
-use crate::subject::{GREY, bits, cases_on, class, make_with, on_each, repeatable};
+use crate::subject::{BLUE, bits, cases_on, class, make_with, on_each, repeatable};
 
-/// A Gaussian: position in camera space as image fractions and depth, log-scales, quaternion, opacity logit and the seed
-/// of its colours.
+/// A Gaussian: position in camera space as image fractions and depth, log-scales, quaternion, opacity logit and the
+/// seed of its colours.
 type Row = ([f64; 3], [f32; 3], [f32; 4], f32, f32);
 
 fn row() -> impl Strategy<Value = Row> {
@@ -84,22 +84,22 @@ fn for_any<S: Strategy>(inputs: &S, check: impl Fn(&Subject, S::Value) -> TestCa
 fn rendering_is_finite_and_independent_of_row_order_and_bands() {
     let rows = prop::collection::vec(row(), 0..60);
     let inputs = (view(), 0..=3_u8, rows, 0..60_usize, 1..400_usize);
-    for_any(&inputs, |subject, (camera, degree, rows, by, cap)| {
+    for_any(&inputs, |subject, (camera, degree, rows, shift, cap)| {
         let whole = model(&camera, degree, &rows);
         let depths = depths(&whole, &camera);
-        let mut turned = whole.clone();
-        let by = by % whole.len().max(1);
-        turned.means.rotate_left(by);
-        turned.log_scales.rotate_left(by);
-        turned.quats.rotate_left(by);
-        turned.opacity_logits.rotate_left(by);
-        turned.sh.rotate_left(by * 3 * sh_coefficients(degree));
-        let render = |model: &Gaussians, cap| render(subject, model, &camera, GREY, cap);
+        let mut reordered = whole.clone();
+        let shift = shift % whole.len().max(1);
+        reordered.means.rotate_left(shift);
+        reordered.log_scales.rotate_left(shift);
+        reordered.quats.rotate_left(shift);
+        reordered.opacity_logits.rotate_left(shift);
+        reordered.sh.rotate_left(shift * 3 * sh_coefficients(degree));
+        let render = |model: &Gaussians, cap| render(subject, model, &camera, BLUE, cap);
         let image = render(&whole, None);
         prop_assert!(image.rgb.iter().chain(&image.depth).all(|v| v.is_finite()));
         let upstream = scenes::narrowed(&scenes::upstream(&camera, 4));
         let mut backend = make_with(subject, &whole, Setup::default());
-        let outcome = backend.differentiate(&camera, GREY, degree, &upstream);
+        let outcome = backend.differentiate(&camera, BLUE, degree, &upstream);
         let (_, gradient) = outcome.expect("a small image is rendered");
         for name in CLASSES {
             prop_assert!(class(&gradient, name).iter().all(|g| g.is_finite()), "{}", name);
@@ -107,7 +107,7 @@ fn rendering_is_finite_and_independent_of_row_order_and_bands() {
         prop_assert!(image.alpha.iter().all(|a| (0.0..=1.0).contains(a)));
         prop_assert!(bits(&render(&whole, Some(cap))) == bits(&image), "bands");
         if depths.windows(2).all(|pair| pair[1] - pair[0] > 1e-5 * pair[1].abs()) {
-            prop_assert!(bits(&render(&turned, None)) == bits(&image), "order");
+            prop_assert!(bits(&render(&reordered, None)) == bits(&image), "order");
         }
         Ok(())
     });
@@ -132,8 +132,8 @@ fn hidden_rows_change_nothing_and_the_background_is_linear() {
             for (c, background) in background.iter().enumerate() {
                 let black = on_black.rgb[3 * p + c];
                 let expected = black + (1.0 - alpha) * background;
-                let off = (on_colour.rgb[3 * p + c] - expected).abs();
-                prop_assert!(off <= 1e-6 * (1.0 + black.abs()), "pixel {p}: {off:e}");
+                let error = (on_colour.rgb[3 * p + c] - expected).abs();
+                prop_assert!(error <= 1e-6 * (1.0 + black.abs()), "pixel {p}: {error:e}");
             }
         }
         Ok(())

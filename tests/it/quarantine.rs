@@ -47,7 +47,7 @@ fn every_non_finite_moment_is_found(subject: &Subject) {
     let model = scenes::cloud(SLOTS + 3, 3, &scenes::camera(33, 30, 71), 72);
     let mut backend = make(subject, &model);
     let names: Vec<String> = backend.state().into_iter().map(|array| array.name).collect();
-    let mut seen = 0;
+    let mut checked = 0;
     for name in names.iter().filter(|name| name.contains("first") || name.contains("second")) {
         let sound = backend.save(name).expect("moments");
         let mut poisoned = sound.clone();
@@ -63,9 +63,9 @@ fn every_non_finite_moment_is_found(subject: &Subject) {
         assert!(found.iter().all(|u| u.kind == NumberKind::Moment), "{name}");
         backend.restore(sound).expect("a restored array");
         assert!(backend.audit().expect("an audit").is_empty(), "{name}");
-        seen += numbers;
+        checked += numbers;
     }
-    assert!(seen >= 2 * SLOTS, "{seen} moments of a row");
+    assert!(checked >= 2 * SLOTS, "{checked} moments of a row");
 }
 
 #[test]

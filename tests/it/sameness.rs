@@ -11,10 +11,10 @@ use densify::selftest::{Differentiable, Setup, Subject, scenes};
 use densify_policies::plan::EditPlan;
 
 use crate::subject::{
-    GREY, atomics, class, devices, make, make_with, repeatable, saved, step_input, storages, wide,
+    BLUE, atomics, class, devices, make, make_with, repeatable, saved, step_input, storages, wide,
 };
 
-/// An image with its gradients, the model after some steps, and their outputs.
+/// The bits of an image and its gradients, the model after some steps, and the outputs of these steps.
 type Run = (Vec<u32>, Gaussians, Vec<StepOutput>);
 
 fn differentiate(
@@ -23,7 +23,7 @@ fn differentiate(
     sh_degree: u8,
 ) -> (Rendering, ModelGradient) {
     let upstream = scenes::narrowed(&scenes::upstream(camera, 12));
-    let outcome = backend.differentiate(camera, GREY, sh_degree, &upstream);
+    let outcome = backend.differentiate(camera, BLUE, sh_degree, &upstream);
     outcome.expect("a small image is rendered")
 }
 
@@ -50,16 +50,16 @@ fn bits((image, gradient): &(Rendering, ModelGradient)) -> Vec<u32> {
 /// Renders once, then trains.
 fn run(backend: &mut dyn Differentiable, camera: &Camera) -> Run {
     let degree = backend.sh_degree();
-    let seen = bits(&differentiate(backend, camera, degree));
+    let bits = bits(&differentiate(backend, camera, degree));
     let (_, target) = scenes::noisy((camera.width, camera.height), 0.0, 3);
     let step = |n| backend.train_step(&step_input(n, camera, &target, degree));
     let outputs: Vec<_> = (1..=4).map(step).collect::<Result<_, _>>().expect("small images");
-    (seen, backend.download().expect("a model"), outputs)
+    (bits, backend.download().expect("a model"), outputs)
 }
 
 /// Clears the number of bands, which may differ.
-fn without_bands((seen, model, outputs): Run) -> Run {
-    (seen, model, outputs.into_iter().map(|output| StepOutput { bands: 1, ..output }).collect())
+fn without_bands((bits, model, outputs): Run) -> Run {
+    (bits, model, outputs.into_iter().map(|output| StepOutput { bands: 1, ..output }).collect())
 }
 
 /// Covers all kinds of parameter storage and equal depths.
@@ -114,8 +114,8 @@ fn room_for_records_changes_nothing() {
     let whole = with(1 << 20, usize::MAX);
     assert!(whole.2[0].entries > 1_500 && whole.2[0].bands == 1, "{:?}", whole.2[0]);
     for (tile_cap, record_cap) in [(1 << 20, 1_500), (1 << 20, 100), (1 << 20, 7), (500, 100)] {
-        let some = with(tile_cap, record_cap);
-        assert!(without_bands(some) == whole, "{tile_cap} pairs, {record_cap} records");
+        let limited = with(tile_cap, record_cap);
+        assert!(without_bands(limited) == whole, "{tile_cap} pairs, {record_cap} records");
     }
 }
 
@@ -134,7 +134,7 @@ fn running_twice_changes_nothing() {
             let _ = differentiate(&mut *backend, &other, 1);
             let second = differentiate(&mut *backend, &camera, 3);
             assert!(bits(&first) == bits(&second), "{name}");
-            let rendered = backend.render(&camera, GREY, 3).expect("a small image is rendered");
+            let rendered = backend.render(&camera, BLUE, 3).expect("a small image is rendered");
             assert!(rendered == first.0, "{name}: render and differentiate draw different images");
             assert!(run(&mut *backend, &camera).0 == bits(&first), "{name}, training");
         }
@@ -175,13 +175,13 @@ fn atomic_accumulation_matches_slots_at_any_cap() {
             let mut backend = make_with(&subject, &model, setup);
             for pass in 1..=3 {
                 let (_, found) = differentiate(&mut *backend, &camera, 1);
-                let what = format!("cap {tile_cap:?}, pass {pass}");
+                let case = format!("cap {tile_cap:?}, pass {pass}");
                 for name in CLASSES {
                     let error = relative_error(class(&found, name), &wide(class(&expected, name)));
-                    table.check(&what, name, error, 2e-5);
+                    table.check(&case, name, error, 2e-5);
                 }
                 for (found, expected) in statistics(&found).into_iter().zip(statistics(&expected)) {
-                    table.check(&what, "statistics", relative_error(found, &wide(expected)), 2e-5);
+                    table.check(&case, "statistics", relative_error(found, &wide(expected)), 2e-5);
                 }
             }
         }

@@ -5,13 +5,13 @@ use densify::core::camera::Camera;
 use densify::core::gaussians::Gaussians;
 use densify::render::Shortcuts;
 
-use crate::subject::{GREY, all, make_with};
+use crate::subject::{BLUE, all, make_with};
 use densify::selftest::compare::{Limits, Table, class, compare_images, relative_error};
 use densify::selftest::reference::{CLASSES, Image, Model, Rules, View, blend, project};
 use densify::selftest::{Setup, scenes};
 
 /// Tolerance of gradients relative to the largest of their class.
-const GRADIENT: f64 = 1e-4;
+const GRADIENT_TOLERANCE: f64 = 1e-4;
 
 /// Overlapping translucent Gaussians, so that blending stops early in many pixels.
 fn scene() -> (Gaussians, Camera) {
@@ -29,7 +29,7 @@ fn truth(
     camera: &Camera,
     rules: &Rules,
 ) -> (Image, Model, densify::selftest::reference::Upstream) {
-    let view = View { camera, background: GREY.map(f64::from), sh_degree: 1 };
+    let view = View { camera, background: BLUE.map(f64::from), sh_degree: 1 };
     let exact = Model::from(model);
     let splats = project::project(&exact, view, rules);
     let order = project::by_depth(&splats);
@@ -59,7 +59,7 @@ fn blending_thresholds_apply_to_the_forward_and_backward_pass() {
         let upstream = scenes::narrowed(&upstream);
         for subject in all() {
             let mut backend = make_with(&subject, &model, Setup { shortcuts, ..Setup::default() });
-            let outcome = backend.differentiate(&camera, GREY, 1, &upstream);
+            let outcome = backend.differentiate(&camera, BLUE, 1, &upstream);
             let (rendering, measured) = outcome.expect("a small image is rendered");
             let name = subject.name();
             let case = format!("{name}, {alpha_min:.4}, {transmittance_min:e}");
@@ -70,7 +70,7 @@ fn blending_thresholds_apply_to_the_forward_and_backward_pass() {
             table.image(&case, "rgb", outcome, tolerances);
             for name in CLASSES {
                 let error = relative_error(class(&measured, name), gradient.class(name));
-                table.check(&case, name, error, GRADIENT);
+                table.check(&case, name, error, GRADIENT_TOLERANCE);
             }
         }
     }

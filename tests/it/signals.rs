@@ -59,8 +59,8 @@ fn rendering_and_loss(model: &Model, view: View<'_>, target: &Image8) -> (Image,
     // Masks reduce the error in proportion.
     let mask = |i: usize| target.mask.as_ref().map_or(1.0, |mask| f64::from(mask[i / 3]) / 255.0);
     let pairs = image.rgb.iter().zip(&truth).enumerate();
-    let seen: Vec<f64> = pairs.map(|(i, (x, y))| y + mask(i) * (x - y)).collect();
-    let mut loss = loss(&seen, &truth, view.camera.width as usize, view.camera.height as usize);
+    let masked: Vec<f64> = pairs.map(|(i, (x, y))| y + mask(i) * (x - y)).collect();
+    let mut loss = loss(&masked, &truth, view.camera.width as usize, view.camera.height as usize);
     for (i, gradient) in loss.gradient.iter_mut().enumerate() {
         *gradient *= mask(i);
     }
@@ -133,7 +133,7 @@ fn contribution(
                 Signal::DepthMin => seen / depth,
                 Signal::PixelSizeMin => seen * focal / depth,
                 Signal::DominantPixels => dominated,
-                other => panic!("{other:?} is no sum over views"),
+                other => panic!("{other:?} is not accumulated over views"),
             }
         })
         .collect()
@@ -173,8 +173,8 @@ fn collect_with(
 #[test]
 fn every_signal_matches_in_any_combination() {
     let views = views();
-    let seen = views.cameras.iter().zip(&views.targets);
-    let gradients: Vec<_> = seen
+    let pairs = views.cameras.iter().zip(&views.targets);
+    let gradients: Vec<_> = pairs
         .map(|(camera, target)| {
             let view = View { camera, background: BACKGROUND.map(f64::from), sh_degree: 2 };
             reference(&views.model, view, target)
@@ -188,9 +188,9 @@ fn every_signal_matches_in_any_combination() {
         let depth = |mean: &[f32; 3]| camera.project(mean.map(f64::from).into()).1;
         views.model.means.iter().map(depth).collect()
     };
-    let mut of_first = depths(&views.cameras[0]);
-    of_first.sort_by(f64::total_cmp);
-    let middle = of_first[of_first.len() / 2] as f32;
+    let mut depths_in_first = depths(&views.cameras[0]);
+    depths_in_first.sort_by(f64::total_cmp);
+    let middle = depths_in_first[depths_in_first.len() / 2] as f32;
     // Each signal is requested alone, with those that need no pixel sums, and with all others, because backends store
     // only requested signals. All are also requested with a reduced weight of near rows.
     let mut requests =

@@ -101,9 +101,9 @@ fn policy_conforms() {
 }
 
 /// A dataset of one view.
-struct One(Camera, SharedImage);
+struct OneView(Camera, SharedImage);
 
-impl ViewSource for One {
+impl ViewSource for OneView {
     fn count(&self) -> usize {
         1
     }
@@ -122,15 +122,15 @@ impl ViewSource for One {
 fn trained(policy: Spatial, backend: Box<dyn Backend>, camera: &Camera) -> (Gaussians, usize) {
     let budget = backend.budget();
     let scene = scene_of(budget);
-    let still = 1e-30;
+    let negligible = 1e-30;
     let rates = RateOptions {
-        mean_start: f64::from(still),
-        mean_end: f64::from(still),
-        log_scale: still,
-        quat: still,
-        opacity: still,
-        sh_dc: still,
-        sh_rest: still,
+        mean_start: f64::from(negligible),
+        mean_end: f64::from(negligible),
+        log_scale: negligible,
+        quat: negligible,
+        opacity: negligible,
+        sh_dc: negligible,
+        sh_rest: negligible,
         ..RateOptions::default()
     };
     let options = TrainOptions {
@@ -144,7 +144,7 @@ fn trained(policy: Spatial, backend: Box<dyn Backend>, camera: &Camera) -> (Gaus
         has_all_bands: false,
         on_nan: OnNan::Stop,
     };
-    let views = One(*camera, Arc::new(scenes::target(camera)));
+    let views = OneView(*camera, Arc::new(scenes::target(camera)));
     let policy: Box<dyn DensityPolicy> = Box::new(policy);
     let mut trainer = Trainer::new(views, backend, ("spatial", policy), scene, options)
         .expect("a policy that declares what it reads");
@@ -202,12 +202,13 @@ fn rows_are_split_moved_and_painted_by_position() {
             let [a, b, c] = model.log_scales[row];
             for part in [place, next] {
                 assert!(close(after.log_scales[part], [a, b - 2.0_f32.ln(), c]), "row {part}");
-                let off = [0, 1, 2].map(|i| f64::from(after.means[part][i] - model.means[row][i]));
+                let offset =
+                    [0, 1, 2].map(|i| f64::from(after.means[part][i] - model.means[row][i]));
                 // Half a standard deviation along the second axis, which the rotation turns into the third.
-                let was = column(model.quats[row], 1);
-                let along: f64 = (0..3).map(|i| off[i] * was[i]).sum();
+                let axis = column(model.quats[row], 1);
+                let along: f64 = (0..3).map(|i| offset[i] * axis[i]).sum();
                 assert!((along.abs() - 0.5 * f64::from(b).exp()).abs() < 1e-5, "row {part}");
-                let turned: f64 = (0..3).map(|i| column(after.quats[part], 2)[i] * was[i]).sum();
+                let turned: f64 = (0..3).map(|i| column(after.quats[part], 2)[i] * axis[i]).sum();
                 assert!((turned + 1.0).abs() < 1e-5, "row {part}: {turned}");
             }
             next += 1;

@@ -4,7 +4,7 @@
 use densify::render::Storage;
 use densify::selftest::{Setup, Subject, scenes};
 
-use crate::subject::{GREY, make, make_with, photograph, step_input, storages};
+use crate::subject::{BLUE, make, make_with, photograph, step_input, storages};
 
 /// The loss falls to a twentieth, as with f32, and then fluctuates with the rounding. Stochastic rounding keeps small
 /// steps that rounding to nearest would lose; `cpu/narrow/tests.rs` checks it number by number.
@@ -19,7 +19,7 @@ fn narrow_storage_trains_as_well_as_f32() {
     for (i, scale) in model.log_scales.iter_mut().flatten().enumerate() {
         *scale += 0.1 * (i as f32 * 2.3).sin();
     }
-    let image = make(&Subject::NATIVE, &truth).render(&camera, GREY, 2).expect("a small image");
+    let image = make(&Subject::NATIVE, &truth).render(&camera, BLUE, 2).expect("a small image");
     let target = photograph(&image);
     // The mean of the last twenty steps.
     let loss = |storage: Storage, steps: u32| {

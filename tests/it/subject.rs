@@ -24,7 +24,7 @@ pub(crate) use densify::selftest::compare::class;
 pub(crate) use densify::selftest::values::RATES;
 
 /// The background of most tests.
-pub(crate) const GREY: [f32; 3] = [0.3, 0.4, 0.6];
+pub(crate) const BLUE: [f32; 3] = [0.3, 0.4, 0.6];
 
 /// The native backend with every instruction set of this machine.
 pub(crate) fn natives() -> Vec<Subject> {
@@ -157,7 +157,7 @@ pub(crate) fn step_input<'a>(
         view: 0,
         camera,
         target,
-        background: GREY,
+        background: BLUE,
         exposure: None,
         sh_degree,
         rates: RATES,

@@ -9,7 +9,7 @@
 //! ## Method
 //!
 //! **Growth** is that of `vanilla`, with its parameters: clones and splits by screen gradient, pruning by
-//! opacity and size, opacity resets, and a hard stop at the budget (or `governor`).
+//! opacity and size, opacity resets, and a hard stop at the budget (with `governor`, a growth curve).
 //!
 //! **Mask.** Each Gaussian has a parameter m, initially `mask_start`. The Gaussian is rendered with opacity and
 //! scales multiplied by 1\[σ(m) > `min_mask`\], whose derivative is taken to be that of σ(m)
@@ -47,7 +47,7 @@
 //! | grow_until | 15000 | >= 0 | step | end of growth, of pruning by opacity and of opacity resets (exclusive) |
 //! | grow_every | 100 | >= 0 | steps | interval of growth; 0: never |
 //! | tau | 0.0002 | >= 0 | 1 / NDC | screen gradient from which a Gaussian is densified |
-//! | small | 0.01 | >= 0 | scene extent | largest size that is cloned; larger ones are split |
+//! | small | 0.01 | >= 0 | scene extent | Gaussians up to this size are cloned, larger ones split |
 //! | split_factor | 1.6 | 1 to 100 | | a split divides the scales by this |
 //! | min_opacity | 0.005 | 0 to 1 | | Gaussians below this opacity are pruned during growth |
 //! | max_scale | 0.1 | > 0 | scene extent | Gaussians above this size are pruned during growth |

@@ -34,10 +34,10 @@ fn pruning_by_mask_is_due_at_growth_steps_and_every_thousand_steps() {
         due_steps("compact-3dgs", &format!("reset_every = 0\n{set}"), &scene)
     };
     let steps = due("", 30_000);
-    // 144 growth steps, 600 to 14,900; from 15,000 on every thousand; the last is the end of the run.
+    // 144 growth steps from 600 to 14,900, then every thousandth step from 15,000 to the end of the run.
     let late: Vec<u32> = (15..=30).map(|thousand| 1000 * thousand).collect();
     assert_eq!((steps[0], &steps[144..]), (600, &late[..]));
-    // A run of 7,000: 1,000 · 7/30 = 233.3 steps, and the last step, which is no multiple.
+    // In a run of 7,000 the interval is 1,000 · 7/30 = 233.3 steps; the last step is due although it is no multiple.
     let short = due("grow_every = 0", 7000);
     assert_eq!((short[0], short.len(), short.last()), (233, 31, Some(&7000)));
     assert_eq!(due("grow_every = 0\nmask_every = 0", 7000), [7000]);
@@ -72,7 +72,7 @@ fn growth_is_that_of_vanilla() {
 }
 
 #[test]
-fn the_control_prunes_at_random_to_the_given_number() {
+fn the_control_prunes_at_random_down_to_the_given_number() {
     assert_eq!(run(&event(15_000, &[1.0; 100]), "random_keep = 1").ops.rows_after, 1);
     let event = event(15_000, &[0.0; 100]);
     let done = run(&event, "random_keep = 40");

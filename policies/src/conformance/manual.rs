@@ -19,27 +19,27 @@ pub fn check_manual(entry: &PolicyEntry) -> Result<(), Report> {
         .take_while(|line| line.starts_with('|'))
         .map(|line| line.trim_matches('|').split('|').map(str::trim).collect())
         .collect();
-    let mut wrong: Vec<String> = Vec::new();
+    let mut errors: Vec<String> = Vec::new();
     for (name, default) in &entry.parameters() {
         match rows.iter().find(|row| row[0] == name) {
-            None => wrong.push(format!("`{name}` is missing")),
+            None => errors.push(format!("`{name}` is missing")),
             Some(row) if row.len() != 5 => {
-                wrong.push(format!("the row of `{name}` has {} cells instead of 5", row.len()));
+                errors.push(format!("the row of `{name}` has {} cells instead of 5", row.len()));
             }
             Some(row) => {
                 if !equals(&parse_value(row[1]), default) {
-                    wrong.push(format!("`{name}` has the default {default}, not {}", row[1]));
+                    errors.push(format!("`{name}` has the default {default}, not {}", row[1]));
                 }
-                wrong.extend(check_range(entry, name, default, row[2]));
+                errors.extend(check_range(entry, name, default, row[2]));
             }
         }
     }
     let known = entry.parameter_names();
     let unknown = rows.iter().map(|row| row[0]).filter(|name| known.iter().all(|k| k != name));
-    wrong.extend(unknown.map(|name| format!("`{name}` is not a parameter")));
+    errors.extend(unknown.map(|name| format!("`{name}` is not a parameter")));
     let mut report = Report::new(entry);
-    if !wrong.is_empty() {
-        report.add(Check::IsDocumented, wrong.join(", "));
+    if !errors.is_empty() {
+        report.add(Check::IsDocumented, errors.join(", "));
     }
     report.result()
 }
@@ -63,8 +63,8 @@ fn check_range(entry: &PolicyEntry, name: &str, default: &Value, range: &str) ->
         entry.build(&set, &scene(10, 100)).map(drop)
     };
     let inside = inside.iter().find_map(|value| {
-        let why = build(value).err()?;
-        Some(format!("`{name}` = {value} is in its range, but: {why}"))
+        let error = build(value).err()?;
+        Some(format!("`{name}` = {value} is in its range, but: {error}"))
     });
     inside.or_else(|| {
         outside.iter().find_map(|value| match build(value) {
@@ -77,8 +77,8 @@ fn check_range(entry: &PolicyEntry, name: &str, default: &Value, range: &str) ->
     })
 }
 
-/// Values inside and outside of a range: `>= a`, `> a`, `a to b` (optionally followed by `, a excluded`,
-/// `, b excluded` or `, both excluded`), or a list of words. `None` for other forms.
+/// Values inside and outside a range of the form `>= a`, `> a`, `a to b` (optionally followed by `, a excluded`,
+/// `, b excluded` or `, both excluded`) or a list of words. `None` for other forms.
 fn boundary_values(range: &str, default: &Value) -> Option<(Vec<Value>, Vec<Value>)> {
     if range.is_empty() {
         return Some((Vec::new(), Vec::new()));

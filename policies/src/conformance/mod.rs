@@ -41,7 +41,7 @@ mod synthetic;
 
 pub use manual::check_manual;
 
-/// A property that every policy must have.
+/// A property that every policy must have. "It" is the policy.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 #[non_exhaustive]
 pub enum Check {
@@ -112,8 +112,8 @@ pub struct Report {
 impl fmt::Display for Report {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "policy {} does not conform:", self.policy)?;
-        for (check, how) in &self.failures {
-            write!(f, "\n- fails the check \"{check}\": {how}")?;
+        for (check, reason) in &self.failures {
+            write!(f, "\n- fails the check \"{check}\": {reason}")?;
         }
         Ok(())
     }
@@ -128,9 +128,9 @@ impl Report {
     }
 
     /// Keeps the first failure of each check.
-    fn add(&mut self, check: Check, how: String) {
+    fn add(&mut self, check: Check, reason: String) {
         if self.failures.iter().all(|(known, _)| *known != check) {
-            self.failures.push((check, how));
+            self.failures.push((check, reason));
         }
     }
 
@@ -147,7 +147,7 @@ pub fn check_policy(entry: &PolicyEntry) -> Result<(), Report> {
     check_policy_with(entry, &Table::new())
 }
 
-/// Runs every check but [`Check::IsDocumented`], with some parameters set.
+/// Runs every check but [`Check::IsDocumented`], with the parameters in `set`.
 ///
 /// # Errors
 /// A report of all checks that failed.
@@ -155,17 +155,17 @@ pub fn check_policy_with(entry: &PolicyEntry, set: &Table) -> Result<(), Report>
     let mut report = Report::new(entry);
     check_building(entry, set, &mut report);
     if report.failures.is_empty() {
-        let mut edits = false;
+        let mut edits_rows = false;
         for scenario in scenarios::scenarios() {
             match run::run(entry, set, &scenario) {
-                Ok(edited) => edits |= edited,
-                Err((check, how)) => report.add(check, format!("{scenario}: {how}")),
+                Ok(edited) => edits_rows |= edited,
+                Err((check, reason)) => report.add(check, format!("{scenario}: {reason}")),
             }
         }
-        if !edits && report.failures.is_empty() {
-            let how = "no plan of any run changed a row, although models had up to 5,000 rows and room \
+        if !edits_rows && report.failures.is_empty() {
+            let reason = "no plan of any run changed a row, although models had up to 5,000 rows and room \
                        to grow; use check_policy_with to set parameters with which the policy acts";
-            report.add(Check::Edits, how.to_owned());
+            report.add(Check::Edits, reason.to_owned());
         }
     }
     report.result()

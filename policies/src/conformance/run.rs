@@ -27,7 +27,7 @@ pub(super) fn run(entry: &PolicyEntry, set: &Table, scenario: &Scenario) -> Resu
     let scene = &scenario.scene;
     let build = || {
         let built = catch_panic(|| entry.build(set, scene));
-        built.and_then(|built| built.map_err(|e| e.to_string())).map_err(|why| (Check::Builds, why))
+        built.and_then(|built| built.map_err(|e| e.to_string())).map_err(|e| (Check::Builds, e))
     };
     let mut policy = build()?;
     let mut copies: Vec<(Check, Box<dyn DensityPolicy>)> =
@@ -36,7 +36,7 @@ pub(super) fn run(entry: &PolicyEntry, set: &Table, scenario: &Scenario) -> Resu
     let needs = policy.needs(scene);
     check_needs(&*policy, &needs, scenario)?;
     if needs != policy.needs(scene) || needs != copies[0].1.needs(scene) {
-        return Err((Check::IsDeterministic, "its needs change".to_owned()));
+        return Err((Check::IsDeterministic, "its needs differ between calls".to_owned()));
     }
 
     let due: Vec<u32> = (1..=scene.iterations).filter(|&step| policy.is_due(step)).collect();
@@ -45,12 +45,12 @@ pub(super) fn run(entry: &PolicyEntry, set: &Table, scenario: &Scenario) -> Resu
     let events = due.len().min(scenario.max_events());
     for (event, &step) in due.iter().take(events).enumerate() {
         let rows = model.rows;
-        let at = |(check, why): Failure| (check, format!("step {step}, {rows} rows: {why}"));
+        let locate = |(check, e): Failure| (check, format!("step {step}, {rows} rows: {e}"));
         if event == events / 3 || event == 2 * events / 3 {
-            copies.push((Check::RestoresState, restored(&*policy, build()?).map_err(at)?));
+            copies.push((Check::RestoresState, restored(&*policy, build()?).map_err(locate)?));
         }
         let ops = run_event(&mut *policy, &mut copies, &needs, scenario, &mut model, step);
-        let ops = ops.map_err(at)?;
+        let ops = ops.map_err(locate)?;
         edits |= ops.edits_rows();
         model.apply(&ops);
     }
@@ -63,11 +63,11 @@ fn check_needs(
     needs: &Needs,
     scenario: &Scenario,
 ) -> Result<(), Failure> {
-    let out_of_range = |why| (Check::DeclaresValidNumbers, why);
+    let out_of_range = |reason| (Check::DeclaresValidNumbers, reason);
     needs.check().map_err(out_of_range)?;
     let mut steps = 1..=scenario.scene.iterations;
     for step in steps.clone() {
-        let at_step = |why| out_of_range(format!("at step {step}, {why}"));
+        let at_step = |reason| out_of_range(format!("at step {step}, {reason}"));
         policy.loss_terms(step, needs.loss_terms).check().map_err(at_step)?;
         policy.noise(step, needs.noise).map_or(Ok(()), |noise| noise.check()).map_err(at_step)?;
         needs.check_resolution(policy.resolution(step)).map_err(at_step)?;
@@ -95,8 +95,8 @@ fn run_event(
     let event = model.event(pattern, scene, step, needs);
     let aux = policy.aux_views(step, rows, budget);
     if aux > 0 && needs.aux.is_none() {
-        let why = "it requests auxiliary views, but its needs do not say what to measure there";
-        return Err((Check::RequestsConsistently, why.to_owned()));
+        let reason = "it requests auxiliary views, but its needs do not say what to measure there";
+        return Err((Check::RequestsConsistently, reason.to_owned()));
     }
     let request = needs.aux.clone().unwrap_or_default();
     let views: Vec<View> = (0..aux.min(scene.train_views).min(MAX_VIEWS))
@@ -108,16 +108,16 @@ fn run_event(
         (policy.cadence(step), terms, policy.noise(step, needs.noise), resolution)
     };
     // Read before planning, which may change the policy's state.
-    let wanted = schedule(policy);
+    let expected = schedule(policy);
     observe(policy, step, rows, &views, &request, false)?;
     let ops = plan(policy, scenario, &event, needs, false)?;
     for (check, copy) in copies {
-        let differs = |how: &str| (*check, format!("a copy {how}"));
+        let differs = |difference: &str| (*check, format!("a copy {difference}"));
         if !copy.is_due(step) {
             return Err(differs("is not due at this step"));
         }
-        if copy.aux_views(step, rows, budget) != aux || schedule(&**copy) != wanted {
-            return Err(differs("requests other views, cadence, resolution, loss terms or noise"));
+        if copy.aux_views(step, rows, budget) != aux || schedule(&**copy) != expected {
+            return Err(differs("differs in views, cadence, resolution, loss terms or noise"));
         }
         let sees_all = *check == Check::ReadsOnlyDeclared;
         observe(&mut **copy, step, rows, &views, &request, sees_all)?;
@@ -126,13 +126,13 @@ fn run_event(
             return Err((*check, format!("{ops:?}, but a copy planned {again:?}")));
         }
         if copy.save() != policy.save() {
-            return Err(differs("saves another state"));
+            return Err(differs("saves a different state"));
         }
     }
     Ok(ops)
 }
 
-/// Shows the views to a policy: only declared columns and points, or everything.
+/// Shows the views to a policy: only declared columns and points or, if it `sees_all`, all of them.
 fn observe(
     policy: &mut dyn DensityPolicy,
     step: u32,
@@ -162,7 +162,7 @@ fn observe(
     Ok(())
 }
 
-/// Has a policy write its plan, from declared inputs only or from everything.
+/// Lets a policy write its plan from the declared inputs only or, if it `sees_all`, from all inputs.
 fn plan(
     policy: &mut dyn DensityPolicy,
     scenario: &Scenario,
@@ -193,8 +193,8 @@ fn plan(
     }
     let ops = plan.compile();
     if (ops.rows_before, ops.budget) != (rows, budget) || ops.rows_after > budget {
-        let why = format!("budget {budget}, but the plan was made for {ops:?}");
-        return Err((Check::KeepsPlan, why));
+        let reason = format!("budget {budget}, but the plan was made for {ops:?}");
+        return Err((Check::KeepsPlan, reason));
     }
     if rows > 0 && ops.rows_after == 0 {
         return Err((Check::LeavesARow, "all rows were pruned".to_owned()));
@@ -202,8 +202,8 @@ fn plan(
     Ok(ops)
 }
 
-fn unexpected_error(why: String) -> Failure {
-    (Check::NeverFails, why)
+fn unexpected_error(reason: String) -> Failure {
+    (Check::NeverFails, reason)
 }
 
 /// Gives `copy` the policy's state, through JSON text as in a checkpoint.
@@ -211,7 +211,7 @@ fn restored(
     policy: &dyn DensityPolicy,
     mut copy: Box<dyn DensityPolicy>,
 ) -> Result<Box<dyn DensityPolicy>, Failure> {
-    let failure = |why| (Check::RestoresState, why);
+    let failure = |reason| (Check::RestoresState, reason);
     let text = policy.save().to_string();
     let state: PolicyState =
         serde_json::from_str(&text).map_err(|error| failure(error.to_string()))?;
@@ -222,13 +222,13 @@ fn restored(
 
 fn rejects_foreign_state(policy: &mut dyn DensityPolicy) -> Result<(), Failure> {
     let foreign = serde_json::json!({ "conformance": "not a state" });
-    let why = match catch_panic(|| policy.restore(foreign)) {
+    let reason = match catch_panic(|| policy.restore(foreign)) {
         Ok(Err(PolicyError::State(_))) => return Ok(()),
-        Ok(Err(error)) => format!("wrong error: {error}"),
+        Ok(Err(error)) => format!("it was refused with the wrong error: {error}"),
         Ok(Ok(())) => "it was accepted".to_owned(),
         Err(panic) => panic,
     };
-    Err((Check::RejectsForeignState, why))
+    Err((Check::RejectsForeignState, reason))
 }
 
 /// The result of `action`, or the message of its panic.

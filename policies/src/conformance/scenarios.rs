@@ -23,7 +23,7 @@ const MAX_EVENTS_IF_LARGE: usize = 40;
 const LARGE_MODEL_ROWS: usize = 5_000;
 
 impl Scenario {
-    /// Maximum number of events that are run.
+    /// Maximum number of events of this run.
     pub(super) fn max_events(&self) -> usize {
         if self.scene.initial_rows >= LARGE_MODEL_ROWS { MAX_EVENTS_IF_LARGE } else { MAX_EVENTS }
     }
@@ -75,11 +75,11 @@ pub(super) fn scenarios() -> Vec<Scenario> {
     let runs = models.into_iter().flat_map(|(name, scene, refuses_growth)| {
         PATTERNS.map(|pattern| Scenario { name, scene: scene.clone(), refuses_growth, pattern })
     });
-    let many = [Pattern::Plausible, Pattern::Mixture].map(|pattern| Scenario {
+    let large = [Pattern::Plausible, Pattern::Mixture].map(|pattern| Scenario {
         name: "thousands of rows",
         scene: scene(LARGE_MODEL_ROWS, LARGE_MODEL_ROWS + LARGE_MODEL_ROWS / 2),
         refuses_growth: false,
         pattern,
     });
-    runs.chain(many).collect()
+    runs.chain(large).collect()
 }

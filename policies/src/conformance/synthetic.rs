@@ -1,4 +1,4 @@
-//! Synthetic statistics, plausible or broken. The number of rows is all that is tracked of the model.
+//! Synthetic statistics, plausible or broken. Of the model, only the number of rows and the candidates are tracked.
 
 use crate::plan::RowOps;
 use crate::policy::{
@@ -6,7 +6,7 @@ use crate::policy::{
 };
 use crate::rng::{PolicyRng, Purpose};
 
-/// The kind of values in the statistics of a run.
+/// The kind of values in the statistics.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Pattern {
     Plausible,
@@ -38,7 +38,7 @@ pub(super) const PATTERNS: [Pattern; 11] = [
     Pattern::Changing,
 ];
 
-/// A value of the pattern, from four random words.
+/// A value that follows `pattern`, from four random words.
 fn value(pattern: Pattern, bits: [u32; 4], plausible: impl Fn(f32) -> f32) -> f32 {
     let u = (bits[0] >> 9) as f32 / 8_388_608.0;
     match pattern {
@@ -128,11 +128,11 @@ impl Model {
         let all = fill(Signal::ALL.into());
         let capacity = needs.candidates.map_or(5, |request| request.capacity);
         for index in 0..capacity.saturating_sub(self.candidates.len()).min(5) as u32 {
-            let part = |part: u32, scale: f32| {
+            let number = |part: u32, scale: f32| {
                 let bits = rng.bits(index, Purpose::Noise, 100 + part);
                 value(pattern, bits, |u| u) * scale
             };
-            self.candidates.push(candidate(part));
+            self.candidates.push(candidate(number));
         }
         Event { step, declared, all, candidates: self.candidates.clone() }
     }
@@ -174,7 +174,7 @@ impl Model {
     }
 }
 
-/// A candidate whose fields are `number(index, scale)`.
+/// A candidate whose components are `number(index of the component, scale)`.
 fn candidate(number: impl Fn(u32, f32) -> f32) -> Candidate {
     Candidate {
         position: [0, 1, 2].map(|part| number(part, 1.0)),

@@ -251,8 +251,8 @@ impl DensityPolicy for Faulty {
             by_gradient = now.signal(Signal::ScreenGradientAbs)?.to_vec();
         }
         if self.has(Fault::ReadsUndeclaredIfPresent) {
-            let better = now.signals.get(Signal::ScreenGradientAbs);
-            by_gradient = better.unwrap_or(gradient).to_vec();
+            let undeclared = now.signals.get(Signal::ScreenGradientAbs);
+            by_gradient = undeclared.unwrap_or(gradient).to_vec();
         }
         if self.has(Fault::ReadsUndeclaredCandidates) {
             by_gradient.truncate(now.candidates.len());
@@ -307,9 +307,9 @@ fn every_fault_is_found() {
     let mut missed = Vec::new();
     for (fault, expected) in FAULTS {
         let report = report(fault);
-        let found = report.as_ref().err().map_or(&[][..], |report| &report.failures);
-        let is_found = |check| found.iter().any(|(failed, _)| *failed == check);
-        if !expected.map_or(found.is_empty(), is_found) {
+        let failures = report.as_ref().err().map_or(&[][..], |report| &report.failures);
+        let is_found = |check| failures.iter().any(|(failed, _)| *failed == check);
+        if !expected.map_or(failures.is_empty(), is_found) {
             missed.push(format!("{fault:?}: {report:?}"));
         }
     }

@@ -14,8 +14,8 @@ impl Diet {
         if every == 0 || from >= until {
             return None;
         }
-        // The number of pixels collected in one interval by a model that fills the budget; never more than the budget's
-        // number of rows.
+        // The number of pixels that a model at the budget collects in one interval, but at most one per row of the
+        // budget.
         let steps = every.min(until - from) as usize;
         let per_step = (scene.budget / self.params.rows_per_candidate as usize).max(1);
         let capacity = steps.saturating_mul(per_step).min(scene.budget).max(1);
@@ -31,7 +31,7 @@ impl Diet {
         })
     }
 
-    /// Appends the worst candidates, evicting rows to make room for them.
+    /// Appends rows at the candidates with the largest errors, evicting other rows to make room.
     pub(super) fn insert(
         &self,
         now: &Snapshot<'_>,
@@ -68,7 +68,7 @@ impl Diet {
     }
 }
 
-/// The squared geometric mean of the positive, finite values; NaN if there is none.
+/// The squared geometric mean of the positive, finite values; NaN if there are none.
 fn squared_geometric_mean(values: &[f32]) -> f32 {
     let logs = values.iter().filter(|v| v.is_finite() && **v > 0.0).map(|v| f64::from(*v).ln());
     let (count, sum) = logs.fold((0.0, 0.0), |(count, sum), log| (count + 1.0, sum + log));

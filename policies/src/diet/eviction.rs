@@ -6,8 +6,8 @@ use crate::policy::{PolicyResult, Signal, Snapshot};
 use crate::sample::smallest;
 
 impl Diet {
-    /// Prunes the `count` least important rows that have no edit yet and are not `exempt`, or all of them if
-    /// there are fewer. New rows are pruned only if there are not enough others.
+    /// Prunes the `count` least important rows that have no edit yet and are not `exempt`, or all such rows if
+    /// there are fewer. Protected (new) rows are pruned only if there are not enough others, the oldest first.
     pub(super) fn evict(
         &self,
         now: &Snapshot<'_>,

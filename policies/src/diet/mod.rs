@@ -5,7 +5,7 @@
 //!
 //! Source: *Gaussians on a Diet: High-Quality Memory-Bounded 3D Gaussian Splatting Training*, arXiv
 //! 2604.20046. Where the paper and its public code differ, or either is in doubt, the default is the
-//! rule that we consider right, and a parameter selects the others.
+//! rule that we consider right, and a parameter selects the other rules.
 //!
 //! ## Method
 //!
@@ -31,8 +31,8 @@
 //! `rho_c` · budget over the whole run, an equal part at each insertion. Where there is no room, the
 //! least important Gaussians are evicted. The list of collected pixels is then cleared.
 //!
-//! **Pruning**, every `prune_every` steps until growth and compensation have ended, evicts Gaussians while there
-//! are more than the budget. (This happens only if the loaded model was too large.)
+//! **Pruning**, every `prune_every` steps until growth and compensation have ended, evicts the Gaussians in excess
+//! of the budget. (There are such Gaussians only if the loaded model was too large.)
 //!
 //! Some defaults differ from paper and code, based on runs of 2,000 to 7,000 steps:
 //! `split` is `long-axis`; `full_depth` suppresses floaters that fit a single photograph; `rho` and
@@ -43,7 +43,7 @@
 //! Each event is one plan in which pruning frees slots before new Gaussians take them, so the budget holds
 //! at all times. The published code exceeds it between insertion and the next pruning; this is not
 //! reproduced. Opacities are never reset. The published settings also use a learning rate of 0.025 for
-//! opacities, which is an option of the trainer.
+//! opacities (`--lr opacity=0.025`).
 //!
 //! ## Choices
 //!
@@ -51,16 +51,16 @@
 //! - `growth = "all"`: every candidate grows as long as there is room or a Gaussian to evict, without the
 //!   limit `rho`, as in the paper and the code.
 //! - `split`: how a candidate larger than `small` is split.
-//!   - `random`: two samples of the parent, with scales divided by `split_factor`, as in the original.
+//!   - `random`: two samples of the parent, with scales divided by `split_factor`, as in `vanilla`.
 //!   - `long-axis`: two halves along the parent's longest axis that keep its two ends, with `child_opacity`
-//!     times its opacity, as in `igs`. With d = `split_share` they are placed at ±3d standard
+//!     times the parent's opacity, as in `igs`. With d = `split_share` they are placed at ±3d standard
 //!     deviations; their longest axis is 1 − d times the parent's, the others √(1 − d²).
-//! - `shift`: the offset of a clone from its parent. Σ sums over the views since the last growth, dL/dμ is
+//! - `shift`: the offset of a clone from its parent. Σ sums over the views since the last growth step, dL/dμ is
 //!   the loss gradient with respect to the mean, s the parent's largest standard deviation. Splits
 //!   are not shifted.
 //!   - `descent`: −`kappa` · s · Σ dL/dμ / Σ |dL/dμ|: against the gradient, by at most `kappa` · s, and by
 //!     less where the views disagree.
-//!   - `paper`: + Σ dL/dμ, the sum over the views. Along the gradient, by about 10⁻⁶ of the scene.
+//!   - `paper`: + Σ dL/dμ, the sum over the views: along the gradient, by about 10⁻⁶ of the scene extent.
 //!   - `code`: + Σ dL/dμ / n², n the number of views. The code divides the gradient of the last view
 //!     by n; here the mean over all views takes the place of that gradient.
 //!   - `none`: no shift.
@@ -73,8 +73,8 @@
 //!   - `fresh`: `fresh_views` random training views, rendered for each event that may evict, as in the
 //!     code. This costs up to a hundred renders per growth step, and a Gaussian visible only in other views
 //!     counts as unimportant.
-//! - `reinit_at`: at this step the whole model is replaced, as the code does at step 5000 of outdoor
-//!   scenes (after Mini-Splatting). All training views are rendered; in each,
+//! - `reinit_at`: at this step the whole model is replaced, as the code does at step 5000 for outdoor
+//!   scenes, following Mini-Splatting. All training views are rendered; in each,
 //!   ⌊`reinit_share` · budget / views⌋ pixels (at least 1) are drawn without replacement in proportion
 //!   to their accumulated alpha. Each becomes a Gaussian with the ground-truth colour at the point where
 //!   its ray is closest to the Gaussian with the largest blend weight. Its size is the root mean
@@ -102,10 +102,10 @@
 //! | tau | 0.0003 | >= 0 | 1 / NDC | gradient g from which a Gaussian is a candidate |
 //! | mixed_gradient | true | | | g = g_p + colour_weight · g_c rather than 2 g_p |
 //! | colour_weight | 30.0 | >= 0 | | weight of the colour gradient |
-//! | full_depth | 0.8 | >= 0 | scene extent | nearer views count less in g; 0: all count equally |
+//! | full_depth | 0.8 | >= 0 | scene extent | depth below which a view counts less in g; 0: all count equally |
 //! | growth | "turnover" | turnover, all | | how many candidates grow |
 //! | rho | 0.25 | >= 0 | budget | maximum number of Gaussians that growth replaces in the whole run |
-//! | small | 0.01 | >= 0 | scene extent | largest size that is cloned; larger ones are split |
+//! | small | 0.01 | >= 0 | scene extent | Gaussians up to this size are cloned, larger ones split |
 //! | split | "long-axis" | random, long-axis | | how a large Gaussian is split |
 //! | split_factor | 1.6 | 1 to 100 | | a `random` split divides the scales by this |
 //! | split_share | 0.45 | 0 to 1, both excluded | | d of a `long-axis` split |
@@ -124,11 +124,11 @@
 //! | compensate_until | 15000 | >= 0 | step | end of compensation (exclusive) |
 //! | insert_every | 500 | >= 0 | steps | interval of insertions; 0: no compensation |
 //! | rho_c | 0.1 | >= 0 | budget | maximum number of Gaussians inserted in the whole run; 0: no compensation |
-//! | rows_per_candidate | 3000 | >= 1 | Gaussians | each step collects one pixel per this many |
+//! | rows_per_candidate | 3000 | >= 1 | Gaussians | Gaussians per pixel that a step collects |
 //! | error | "l1-dssim" | l1-dssim, l1, grad | | error that ranks pixels |
 //! | depth | "max-weight" | max-weight, median | | surface point on a pixel's ray |
 //! | nms | true | | | non-maximum suppression of pixels |
-//! | min_alpha | 0.5 | 0 to 1 | | smallest accumulated alpha of a pixel |
+//! | min_alpha | 0.5 | 0 to 1 | | smallest accumulated alpha of a collected pixel |
 //! | newborn_size | "pixel" | pixel, code | | size of inserted Gaussians |
 //! | size_pixels | 2.0 | > 0 | pixels | size of inserted Gaussians for `pixel` |
 //! | newborn_opacity | 0.1 | 0 to 1, both excluded | | opacity of inserted Gaussians |
@@ -187,11 +187,11 @@ pub struct Diet {
     insert: Window,
     /// Rows younger than this are protected `[steps]`.
     protected_age: f32,
-    /// Surface points for the current re-initialisation. Not saved, as the event consumes them.
+    /// Surface points for the current re-initialisation. Not saved, as the same event uses and clears them.
     surface: Vec<Candidate>,
-    /// Largest blend weights in the auxiliary views of the current event. Not saved, as the event consumes
-    /// them.
-    fresh: Vec<f32>,
+    /// Largest blend weight of each row in the auxiliary views of the current event. Not saved, as the same event
+    /// uses and clears them.
+    weight_max: Vec<f32>,
 }
 
 impl ConfiguredPolicy for Diet {
@@ -221,7 +221,7 @@ impl ConfiguredPolicy for Diet {
             insert: Window { from, until, every: if compensates { insert_every } else { 0 } },
             protected_age: params.protect.min(scene.train_views) as f32,
             surface: Vec::new(),
-            fresh: Vec::new(),
+            weight_max: Vec::new(),
             params,
         })
     }
@@ -282,9 +282,9 @@ impl DensityPolicy for Diet {
             self.surface.extend_from_slice(view.points);
             return Ok(());
         }
-        self.fresh.resize(view.rows, 0.0);
-        for (so_far, &weight) in self.fresh.iter_mut().zip(view.column(AuxColumn::WeightMax)?) {
-            *so_far = so_far.max(weight);
+        self.weight_max.resize(view.rows, 0.0);
+        for (max, &weight) in self.weight_max.iter_mut().zip(view.column(AuxColumn::WeightMax)?) {
+            *max = max.max(weight);
         }
         Ok(())
     }
@@ -294,12 +294,12 @@ impl DensityPolicy for Diet {
             self.reinit(now.scene.extent, plan);
             return Ok(());
         }
-        let mut fresh = std::mem::take(&mut self.fresh);
+        let mut weight_max = std::mem::take(&mut self.weight_max);
         let importance = match self.params.importance {
             Importance::Epochs => now.signal(Signal::WeightMax)?,
             Importance::Fresh => {
-                fresh.resize(now.rows(), 0.0);
-                &fresh
+                weight_max.resize(now.rows(), 0.0);
+                &weight_max
             }
         };
         let grows = self.grow.is_due(now.step);
@@ -372,7 +372,7 @@ impl Diet {
         Ok(gradient)
     }
 
-    /// The dead rows, ascending; never all of them.
+    /// The rows below the opacity limit or above the size limit, ascending; never all rows.
     fn dead(&self, now: &Snapshot<'_>) -> PolicyResult<Vec<u32>> {
         let DietParams { min_opacity, max_scale, max_scale_from, .. } = self.params;
         let limits = PruneLimits::at(now, min_opacity, max_scale, max_scale_from);
@@ -381,7 +381,7 @@ impl Diet {
         Ok(dead)
     }
 
-    /// Living rows with g >= tau, the largest g first.
+    /// Rows that are not in `dead` and have g >= `tau`, the largest g first.
     fn candidates(&self, gradient: &[f32], dead: &[u32]) -> Vec<u32> {
         let tau = self.params.tau as f32;
         let rows = (0..gradient.len() as u32)

@@ -38,7 +38,7 @@ fn candidate(error: f32, pixel_size: f32) -> Candidate {
 }
 
 #[test]
-fn the_gradient_mixes_screen_and_colour() {
+fn the_gradient_combines_screen_and_colour_gradients() {
     // Means: 4.0e-4; 2e-4 + 30·7e-6 = 4.1e-4; 2e-4 + 30·6e-6 = 3.8e-4; 30·1.4e-5 = 4.2e-4; 1.9e-4.
     let event = event(600, 5, 100)
         .with(Signal::ScreenGradient, &[16.01e-4, 8.01e-4, 8.01e-4, 0.0, 7.6e-4])
@@ -52,7 +52,7 @@ fn the_gradient_mixes_screen_and_colour() {
 }
 
 #[test]
-fn at_the_budget_the_least_important_are_replaced() {
+fn at_the_budget_the_least_important_rows_are_replaced() {
     // `rho` 9.4 over 94 events is a tenth of the budget per event: two of 20 rows, the least important of those that
     // are not candidates.
     let event =
@@ -79,7 +79,7 @@ fn event_quotas_add_up_to_the_share() {
     let quarter = parts(0.25, window, 200_000);
     assert_eq!((quarter.len(), quarter.iter().sum()), (94, 50_000));
     assert!(quarter.iter().all(|part| (531..=532).contains(part)));
-    // Fewer than one per event.
+    // Less than one row per event.
     assert_eq!(parts(0.25, window, 100).iter().sum::<usize>(), 25);
     // Products that rounding puts just below an integer.
     assert_eq!((share_of_budget(0.29, 100), share_of_budget(0.1, 29)), (29, 2));
@@ -90,7 +90,7 @@ fn event_quotas_add_up_to_the_share() {
 
 #[test]
 fn pruned_slots_and_room_are_used_before_rows_are_evicted() {
-    // 19 rows, one dead, budget 20: room for 2, and 2 more by eviction.
+    // 19 rows, one dead, budget 20: there is room for 2, and eviction makes room for 2 more.
     let mut opacity = [0.5; 19];
     opacity[7] = 0.0049;
     let event = event(600, 19, 20)
@@ -125,11 +125,11 @@ fn huge_rows_are_kept_unless_a_size_limit_is_set() {
 
 #[test]
 fn importance_may_be_measured_in_fresh_views() {
-    // By default (`importance = "epochs"`), rows 0 and 1 are least important; in the fresh views row 4, a candidate,
-    // then 6 and 2.
+    // By default (`importance = "epochs"`), rows 0 and 1 are the least important ones; in the fresh views, rows 4 (a
+    // candidate), 6 and 2 are.
     let fresh = [0.3, 0.4, 0.02, 0.5, 0.0, 0.6, 0.01, 0.7];
     let mut event = event(600, 8, 8).with(Signal::ScreenGradient, &gradient_sums(8, &[4, 7]));
-    // Each row is in one of two views.
+    // Each row is visible in one of two views.
     let weights = |parity: usize| -> Vec<f32> {
         (0..8).map(|row| if row % 2 == parity { fresh[row] } else { 0.0 }).collect()
     };
@@ -180,7 +180,7 @@ fn new_rows_are_protected_for_an_epoch() {
 
 #[test]
 fn if_too_few_rows_are_old_the_oldest_new_ones_are_evicted() {
-    // One row is old and three must go: the old one first, then the two of age 60 by importance.
+    // One row is old and three must be pruned: the old one first, then the two of age 60 by importance.
     let event = event(600, 6, 6)
         .with(Signal::ScreenGradient, &gradient_sums(6, &[5]))
         .with(Signal::Age, &[10.0, 60.0, 60.0, 59.0, 200.0, 0.0]);
@@ -210,18 +210,18 @@ fn each_shift_rule_gives_the_documented_offset() {
         };
         offspring[..2].iter().map(|offspring| offset(offspring.placement)).collect()
     };
-    let near = |found: &[[f32; 3]], expected: [f32; 3]| {
+    let assert_near = |shifts: &[[f32; 3]], expected: [f32; 3]| {
         for axis in 0..3 {
-            assert!(found[1][axis].abs() < 1e-30, "a row without gradients moved");
-            assert!((found[0][axis] - expected[axis]).abs() < 1e-9, "{found:?}, {expected:?}");
+            assert!(shifts[1][axis].abs() < 1e-30, "a row without gradients moved");
+            assert!((shifts[0][axis] - expected[axis]).abs() < 1e-9, "{shifts:?}, {expected:?}");
         }
     };
     // −0.1 · 0.05 · (0.3, 0, 0.4)
-    near(&shifts(""), [-1.5e-3, 0.0, -2.0e-3]);
-    near(&shifts("kappa = 0.2"), [-3e-3, 0.0, -4e-3]);
-    near(&shifts("shift = \"paper\""), [3e-4, 0.0, 4e-4]);
-    near(&shifts("shift = \"code\""), [3e-4 / 16.0, 0.0, 4e-4 / 16.0]);
-    near(&shifts("shift = \"none\""), [0.0; 3]);
+    assert_near(&shifts(""), [-1.5e-3, 0.0, -2.0e-3]);
+    assert_near(&shifts("kappa = 0.2"), [-3e-3, 0.0, -4e-3]);
+    assert_near(&shifts("shift = \"paper\""), [3e-4, 0.0, 4e-4]);
+    assert_near(&shifts("shift = \"code\""), [3e-4 / 16.0, 0.0, 4e-4 / 16.0]);
+    assert_near(&shifts("shift = \"none\""), [0.0; 3]);
 }
 
 #[test]
@@ -287,7 +287,7 @@ fn rows_pruned_for_the_budget_do_not_grow() {
 
 #[test]
 fn the_worst_pixels_become_rows() {
-    // Budget 40: two rows per insertion. 39 rows: one is evicted.
+    // With a budget of 40, two rows are inserted per event; from 39 rows, one is evicted.
     let mut event = event(10_500, 39, 40);
     event.candidates = vec![candidate(0.1, 0.01), candidate(0.3, 0.02), candidate(0.2, 0.03)];
     let done = run(&event, "rho_c = 0.45");
@@ -308,8 +308,8 @@ fn the_worst_pixels_become_rows() {
 #[test]
 fn no_row_is_evicted_for_a_pixel_without_a_point() {
     let mut event = event(10_500, 40, 40);
-    let nowhere = Candidate { position: [f32::NAN; 3], ..candidate(0.9, 0.01) };
-    event.candidates = vec![nowhere, candidate(0.1, 0.0), candidate(0.2, 0.01)];
+    let no_point = Candidate { position: [f32::NAN; 3], ..candidate(0.9, 0.01) };
+    event.candidates = vec![no_point, candidate(0.1, 0.0), candidate(0.2, 0.01)];
     let done = run(&event, "rho_c = 0.45");
     assert_eq!(done.pruned, [0]);
     assert_eq!(done.ops.counts, EditCounts { removed: 1, added: 1, updated: 0, denied: 2 });
@@ -326,7 +326,7 @@ fn with_newborn_size_code_the_size_is_the_squared_geometric_mean_of_the_scales()
 
 #[test]
 fn growth_pruning_and_insertion_can_fall_on_one_step() {
-    // 44 rows, budget 40: four go; three candidates want room, two rows are to be inserted.
+    // 44 rows, budget 40: four are pruned for the budget, three candidates need room, and two rows are inserted.
     let mut event =
         event(1000, 44, 40).with(Signal::ScreenGradient, &gradient_sums(44, &[5, 40, 41]));
     event.candidates = (1..9).map(|i| candidate(i as f32 / 10.0, 0.01)).collect();
@@ -369,7 +369,7 @@ fn needs_list_only_used_signals() {
     assert!(request.spaced && request.rows_per_candidate == 3000);
     assert!((request.min_alpha - 0.5).abs() < 1e-9);
 
-    // 0.8 extents.
+    // 0.8 times the extent.
     assert!((full.full_depth - 0.8 * scene.extent).abs() < 1e-6 * scene.extent);
     assert!(needs("full_depth = 0.0").full_depth.abs() < 1e-9);
 
@@ -427,11 +427,11 @@ fn the_model_is_replaced_by_surface_points() {
     assert_eq!((seeds[1].position, seeds[1].colour), ([1.0, 0.0, 0.0], [0.5, 0.5, 1.0]));
     assert!(seeds.iter().all(|seed| (seed.opacity - 0.1).abs() < 1e-6));
     assert!((seeds[4].position[0] - 100.0).abs() < 1e-6);
-    // Never more than its share of the budget, however many points there are.
+    // Never more than `reinit_share` of the budget, however many points there are.
     event.views = vec![surface(0.0, 9); 3];
     event.scene.train_views = 1;
     assert_eq!(run(&event, "reinit_at = 5000\nreinit_share = 0.4").ops.rows_after, 4);
-    // At other steps, and without points, all is as usual.
+    // At other steps, and without points, the model is kept.
     assert!(run(&Event { step: 5050, ..event.clone() }, "reinit_at = 5000").ops.is_empty());
     event.views.clear();
     assert!(run(&event, "reinit_at = 5000").ops.is_empty());
@@ -443,15 +443,15 @@ fn coinciding_and_isolated_points_have_a_size() {
     let mut event = event(5000, 3, 10);
     event.scene.train_views = 1;
     let point = Candidate { position: [1.0, 2.0, 3.0], ..candidate(0.5, 0.01) };
-    let nowhere = Candidate { position: [f32::NAN; 3], ..point };
+    let no_point = Candidate { position: [f32::NAN; 3], ..point };
     let scales = |points: Vec<Candidate>| -> Vec<f32> {
         let views = vec![View { points, ..View::default() }];
         let done = run(&Event { views, ..event.clone() }, "reinit_at = 5000");
         done.ops.seeds.iter().map(|(_, seed)| seed.scales[1]).collect()
     };
-    // 2e-4 and 0.02 of the extent of 10.
+    // 2e-4 and 0.02 times the extent of 10.
     assert_eq!(scales(vec![point, point]), [2e-3, 2e-3]);
-    assert_eq!(scales(vec![point, nowhere]), [0.2]);
+    assert_eq!(scales(vec![point, no_point]), [0.2]);
 }
 
 #[test]

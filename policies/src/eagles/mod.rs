@@ -17,8 +17,8 @@
 //! and yield fewer and smoother Gaussians.
 //!
 //! **Growth** is that of `vanilla`, with its parameters, but ends later and has longer intervals: clones and
-//! splits by screen gradient, pruning by opacity and size, opacity resets, and a hard stop at the budget (or
-//! `governor`).
+//! splits by screen gradient, pruning by opacity and size, opacity resets, and a hard stop at the budget
+//! (with `governor`, a growth curve).
 //!
 //! **Pruning.** A Gaussian's influence is the sum of its blend weights α·T over all pixels of the views
 //! trained on since the last prune, or since it was created. Every `prune_every` steps before `prune_until`,
@@ -37,9 +37,9 @@
 //! ## Differences from the published code
 //!
 //! - The paper also encodes colours, rotations and opacities as quantised vectors with small decoders. This
-//!   reduces file size and is not part of density control; it is left out, with its learning rates.
+//!   reduces file size and is not part of density control, so the encoding and its learning rates are left out.
 //! - Images are downscaled by averaging over each pixel's area, whereas the published code interpolates
-//!   between four pixels and skips others. They are never downscaled below 16 pixels a side.
+//!   between four pixels and skips the others. They are never downscaled below 16 pixels a side.
 //! - The code's own defaults are a different configuration: `prune_every` = 3000, `prune_share` = 0.05,
 //!   `prune_until` = 24000, growth as in `vanilla`, and full-size images (`whole_from` = 0).
 //! - The last Gaussian is never pruned.
@@ -54,7 +54,7 @@
 //! | grow_until | 18000 | >= 0 | step | end of growth, of pruning by opacity and of opacity resets (exclusive) |
 //! | grow_every | 125 | >= 0 | steps | interval of growth; 0: never |
 //! | tau | 0.0002 | >= 0 | 1 / NDC | screen gradient from which a Gaussian is densified |
-//! | small | 0.01 | >= 0 | scene extent | largest size that is cloned; larger ones are split |
+//! | small | 0.01 | >= 0 | scene extent | Gaussians up to this size are cloned, larger ones split |
 //! | split_factor | 1.6 | 1 to 100 | | a split divides the scales by this |
 //! | min_opacity | 0.005 | 0 to 1 | | Gaussians below this opacity are pruned during growth |
 //! | max_scale | 0.1 | > 0 | scene extent | Gaussians above this size are pruned during growth |
@@ -68,7 +68,7 @@
 //! | prune_every | 5100 | >= 0 | steps | interval of prunes; 0: never |
 //! | prune_until | 27000 | >= 0 | step | end of prunes (exclusive) |
 //! | prune_share | 0.15 | 0 to 1 | Gaussians | quantile of influence up to which Gaussians are pruned |
-//! | victims | "lowest" | lowest, random | | which Gaussians are pruned |
+//! | victims | "lowest" | lowest, random | | which Gaussians are pruned: the least influential or random ones |
 //!
 //! Defaults in steps are for a run of 30,000 iterations and scale with its length; intervals
 //! (`…_every`) do not shrink below 100 steps.
@@ -178,8 +178,8 @@ impl DensityPolicy for Eagles {
         if step >= whole_from {
             return 1.0;
         }
-        let done = f64::from(step) / f64::from(whole_from);
-        (1.0 - (1.0 - first) * 0.5 * (1.0 + (PI * done).cos())).clamp(first, 1.0)
+        let progress = f64::from(step) / f64::from(whole_from);
+        (1.0 - (1.0 - first) * 0.5 * (1.0 + (PI * progress).cos())).clamp(first, 1.0)
     }
 
     fn plan(&mut self, now: &Snapshot<'_>, rng: &PolicyRng, plan: &mut EditPlan) -> PolicyResult {

@@ -17,7 +17,7 @@ fn event(step: u32, influence: &[f32]) -> Event {
 }
 
 #[test]
-fn the_least_influential_are_pruned_and_sums_are_reset() {
+fn the_least_influential_rows_are_pruned_and_sums_are_reset() {
     // The 0.15 quantile of 0..=20 is 3: four rows are at or below it.
     let influence: Vec<f32> = (0..21_u8).rev().map(f32::from).collect();
     let done = run(&event(5100, &influence), "");
@@ -28,23 +28,23 @@ fn the_least_influential_are_pruned_and_sums_are_reset() {
     assert!(run(&event(5100, &influence), "prune_share = 0").pruned == [20]);
     // One row is left.
     assert_eq!(run(&event(5100, &influence), "prune_share = 1.0").pruned.len(), 20);
-    // Rows that no view has shown have equal influence and are pruned together.
+    // Rows that were visible in no view have equal influence and are pruned together.
     let unseen = [0.0, 5.0, 0.0, f32::NAN, 0.0, 7.0, 8.0, 9.0];
     assert_eq!(run(&event(5100, &unseen), "").pruned, [0, 2, 3, 4]);
 }
 
 #[test]
 fn the_resolution_rises_along_half_a_cosine() {
-    let at = |set: &str, step| {
+    let factor = |set: &str, step| {
         let policy = build("eagles", set, &Event::new(1, 1, 1).scene);
         (policy.resolution(step) * 1e6).round() / 1e6
     };
-    // 1 − 0.7·½·(1 + cos(π·t/21,000)): at a third 1 − 0.7·¾, at half 1 − 0.35, at two thirds 1 − 0.7·¼.
-    let found = [0, 7000, 10_500, 14_000, 20_999, 21_000, 30_000].map(|step| at("", step));
-    assert_eq!(found, [0.3, 0.475, 0.65, 0.825, 1.0, 1.0, 1.0]);
-    assert_eq!([1, 500].map(|step| at("whole_from = 0", step)), [1.0, 1.0]);
-    assert_eq!(at("first_resolution = 1.0", 1), 1.0);
-    assert_eq!(at("first_resolution = 0.5\nwhole_from = 100", 50), 0.75);
+    // 1 − 0.7·½·(1 + cos(π·t/21,000)): 1 − 0.7·¾ at a third, 1 − 0.35 at half, 1 − 0.7·¼ at two thirds of 21,000.
+    let factors = [0, 7000, 10_500, 14_000, 20_999, 21_000, 30_000].map(|step| factor("", step));
+    assert_eq!(factors, [0.3, 0.475, 0.65, 0.825, 1.0, 1.0, 1.0]);
+    assert_eq!([1, 500].map(|step| factor("whole_from = 0", step)), [1.0, 1.0]);
+    assert_eq!(factor("first_resolution = 1.0", 1), 1.0);
+    assert_eq!(factor("first_resolution = 0.5\nwhole_from = 100", 50), 0.75);
     let scene = Event::new(1, 1, 1).scene;
     let declared = |set: &str| build("eagles", set, &scene).needs(&scene).least_resolution;
     assert_eq!(declared(""), Some(0.3));

@@ -15,7 +15,7 @@
 //! views that saw the Gaussian. Candidates are drawn without replacement, in proportion to their edge
 //! scores, until the curve is reached. To compute the scores, `views` random training views are rendered;
 //! in each, a Gaussian's score is the sum of the edge map over the pixels that it is blended into, divided
-//! by the mean of all Gaussians with a positive sum; the scores of all views are added. The first growth
+//! by the mean of all positive sums of the view; the scores of all views are added. The first growth
 //! step after a recovery prune uses all views. After `final_from` the gradient itself is the score, no view
 //! is rendered, and `tau` is divided by `final_divisor`.
 //!
@@ -34,9 +34,9 @@
 //! **Opacity resets** limit opacities to `reset_opacity` every `reset_every` steps, `resets` times in
 //! total, and never from `grow_until` on. By default only the first two are followed by a recovery prune.
 //!
-//! **The optimiser** steps at every iteration up to `sum_from`, then once per `sum` iterations, after
-//! `sum_more_from` once per `sum_more`, on the summed gradients. The learning rate of the means falls
-//! from `mean_start` to `mean_end`; that of SH bands 1–3 is `sh_rest`. (`--lr` overrides both.)
+//! **The optimiser** steps at every iteration up to `sum_from`, then once per `sum` iterations, and after
+//! `sum_more_from` once per `sum_more` iterations, on the gradients summed in between. The learning rate of the
+//! means falls from `mean_start` to `mean_end`; that of SH bands 1–3 is `sh_rest`. (`--lr` overrides both.)
 //!
 //! ## Differences from the published code
 //!
@@ -47,10 +47,10 @@
 //!   in a run of any length.
 //! - The published code splits, then prunes. A plan has one edit per Gaussian: if a Gaussian is drawn and
 //!   its children would be pruned in the same event, it is pruned itself. The result is the same.
-//! - `recover` counts optimiser steps and does not scale with the length of the run, but is at most half
-//!   the interval of resets, so that the prune comes before the next reset.
-//! - The published code averages gradients from step 500 on; here the first growth averages over all
-//!   steps before it.
+//! - `recover` is a number of optimiser steps, so it does not scale with the length of the run; it is at most
+//!   half the interval of resets, so that the prune comes before the next reset.
+//! - The published code averages gradients from step 500 on; here the first growth step averages over
+//!   all steps before it.
 //! - The published code divides edge scores by their mean over all Gaussians; here the mean is over the
 //!   Gaussians with a positive score in the view.
 //! - The last Gaussian is never pruned.
@@ -62,13 +62,13 @@
 //! | grow_from | 500 | >= 0 | step | start of growth and pruning (exclusive) |
 //! | grow_until | 15000 | >= 0 | step | end of growth, pruning and resets (exclusive) |
 //! | grow_every | 100 | >= 0 | steps | interval of growth and pruning; 0: never |
-//! | curve_until | 14500 | >= 0 | step | when the growth curve reaches the budget |
+//! | curve_until | 14500 | >= 0 | step | step at which the growth curve reaches the budget |
 //! | tau | 0.0003 | >= 0 | 1 / NDC | absolute screen gradient from which a Gaussian may be split |
-//! | views | 10 | >= 1 | views | views rendered per growth; all if there are fewer |
+//! | views | 10 | >= 1 | views | views rendered per growth step; all if there are fewer |
 //! | split_share | 0.45 | 0 to 1, both excluded | | d of the split |
 //! | child_opacity | 0.6 | 0 to 1, 0 excluded | | factor on the children's opacity |
 //! | final_from | 14500 | >= 0 | step | start of growth by gradient (exclusive) |
-//! | final_divisor | 1.5 | >= 1 | | divisor of `tau` from then on |
+//! | final_divisor | 1.5 | >= 1 | | divisor of `tau` after `final_from` |
 //! | min_opacity | 0.005 | 0 to 1 | | Gaussians below this opacity are pruned |
 //! | prune_last | false | | | also prune at the last growth step |
 //! | first_prune_at | 300 | >= 0 | step | step of the first prune; 0: none |
@@ -77,13 +77,13 @@
 //! | resets | 4 | >= 0 | | number of opacity resets |
 //! | reset_opacity | 0.05 | 0 to 1, both excluded | | largest opacity after a reset |
 //! | recover | 300 | >= 1 | steps | steps from a reset to its recovery prune |
-//! | recoveries | 2 | >= 0 | | number of recovery prunes, after the first resets |
+//! | recoveries | 2 | >= 0 | | number of recovery prunes, one after each of the first resets |
 //! | recovery_share | 0.2 | 0 to 1 | Gaussians | share that a recovery prune removes; 0: none |
 //! | sum_from | 15000 | >= 0 | step | start of summing gradients over `sum` iterations (exclusive) |
 //! | sum | 5 | 1 to 1000 | steps | iterations per optimiser step after `sum_from` |
-//! | sum_more_from | 22500 | >= 0 | step | start of summing them over `sum_more` iterations (exclusive) |
+//! | sum_more_from | 22500 | >= 0 | step | start of summing gradients over `sum_more` iterations (exclusive) |
 //! | sum_more | 20 | 1 to 1000 | steps | iterations per optimiser step after `sum_more_from` |
-//! | sums | "scaled" | scaled, fixed | | whether `sum` and `sum_more` scale with the run |
+//! | sums | "scaled" | scaled, fixed | | whether `sum` and `sum_more` scale with the length of the run |
 //! | mean_start | 0.00004 | > 0 | extent / step | learning rate of the means at the start |
 //! | mean_end | 0.000002 | > 0 | extent / step | learning rate of the means at the end |
 //! | sh_rest | 0.00025 | > 0 | | learning rate of SH bands 1–3 |
@@ -128,7 +128,7 @@ pub struct Igs {
     score: EdgeScore,
 }
 
-/// Edge scores of the current event. Not saved, as each event starts from zero.
+/// Edge score of each row over the views of one event. Not saved, as each event starts from zero.
 #[derive(Debug, Default)]
 struct EdgeScore {
     step: u32,
@@ -270,7 +270,7 @@ impl Igs {
                 .is_some_and(|reset| reset <= last && self.resets.is_due(reset))
     }
 
-    /// True if the gradient is the score.
+    /// True if candidates at `step` are drawn by their gradients instead of edge scores.
     fn is_final(&self, step: u32) -> bool {
         step > self.params.final_from
     }
@@ -290,7 +290,7 @@ impl Igs {
         (budget as f64 * passed.min(1.0).sqrt()).floor() as usize
     }
 
-    /// Draws candidates to split by their scores, as many as the curve allows.
+    /// Draws candidates to split in proportion to their scores, as many as the curve allows.
     fn draw(
         &self,
         now: &Snapshot<'_>,
@@ -334,18 +334,18 @@ impl Igs {
         for &row in drawn {
             after[row as usize] *= self.params.child_opacity as f32;
         }
-        let mut least = 0.0;
+        let mut limit = 0.0;
         let is_last = !self.grow.is_due(now.step.saturating_add(self.params.grow_every));
         if self.grow.is_due(now.step) && (self.params.prune_last || !is_last) {
-            least = self.params.min_opacity as f32;
+            limit = self.params.min_opacity as f32;
         }
         if self.is_recovery_prune(now.step) {
             plan.cause("recovery-prune");
             let children = drawn.iter().map(|row| &after[*row as usize]);
-            let left = after.iter().chain(children).copied().filter(|&opacity| opacity >= least);
-            least = limit_of_share(left.collect(), self.params.recovery_share).max(least);
+            let left = after.iter().chain(children).copied().filter(|&o| o >= limit);
+            limit = limit_of_share(left.collect(), self.params.recovery_share).max(limit);
         }
-        let is_kept = |row: &u32| after[*row as usize] >= least;
+        let is_kept = |row: &u32| after[*row as usize] >= limit;
         let mut dead: Vec<u32> = (0..now.rows() as u32).filter(|row| !is_kept(row)).collect();
         spare_one(&mut dead, opacity);
         plan.prune_all(dead);
@@ -359,10 +359,10 @@ fn limit_of_share(mut values: Vec<f32>, share: f64) -> f32 {
     if values.is_empty() {
         return 0.0;
     }
-    let place = share * (values.len() - 1) as f64;
+    let rank = share * (values.len() - 1) as f64;
     // A product just above an integer counts as that integer: its relative error is at most 2⁻⁵³.
-    let place = (place * (1.0 - f64::EPSILON)).ceil() as usize;
-    *values.select_nth_unstable_by(place, f32::total_cmp).1
+    let rank = (rank * (1.0 - f64::EPSILON)).ceil() as usize;
+    *values.select_nth_unstable_by(rank, f32::total_cmp).1
 }
 
 #[cfg(test)]

@@ -91,7 +91,7 @@ impl Default for IgsParams {
 }
 
 impl IgsParams {
-    /// `sum` and `sum_more` for a run of `iterations`.
+    /// `sum` and `sum_more` for a run of this number of iterations.
     pub(super) fn scaled_sums(&self, iterations: u32) -> [u32; 2] {
         [self.sum, self.sum_more].map(|sum| match self.sums {
             SumScaling::Fixed => sum,
@@ -106,10 +106,10 @@ impl IgsParams {
     /// Checks ranges.
     pub(super) fn check(&self) -> PolicyResult {
         let positive = (Excluded(0.0), Unbounded);
-        let inside = (Excluded(0.0), Excluded(1.0));
+        let open_unit = (Excluded(0.0), Excluded(1.0));
         in_range("tau", self.tau, 0.0..)?;
         in_range("views", self.views.into(), 1.0..)?;
-        in_range("split_share", self.split_share, inside)?;
+        in_range("split_share", self.split_share, open_unit)?;
         in_range("child_opacity", self.child_opacity, (Excluded(0.0), Included(1.0)))?;
         in_range("final_divisor", self.final_divisor, 1.0..)?;
         in_range("min_opacity", self.min_opacity, 0.0..=1.0)?;

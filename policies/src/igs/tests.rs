@@ -7,8 +7,8 @@ fn run(event: &Event, set: &str) -> Outcome {
     event.run("igs", set)
 }
 
-/// Rows of opacity 0.5, seen by four views with a mean absolute gradient of 1. One auxiliary view has these
-/// edge sums.
+/// Rows of opacity 0.5, seen by four views with a mean absolute gradient of 1. In the only auxiliary view, the
+/// edge sums of the rows are `edges`.
 fn event(step: u32, edges: &[f32], budget: usize) -> Event {
     let mut event = Event::new(step, edges.len(), budget)
         .with_all(Signal::VisibleCount, 4.0)
@@ -40,7 +40,7 @@ fn growth_follows_the_square_root() {
 
 #[test]
 fn only_candidates_with_edges_are_split() {
-    // Means 3.0e-4 (just enough), 2.9e-4, large, large without edges.
+    // Means: 3.0e-4 (just enough), 2.9e-4, large, large but without edges.
     let event = event(14_400, &[1.0, 5.0, 1.0, 0.0], 100)
         .with(Signal::ScreenGradientAbs, &[12.01e-4, 11.6e-4, 1.0, 1.0]);
     let mut split = run(&event, "").split;
@@ -53,8 +53,8 @@ fn only_candidates_with_edges_are_split() {
         split
     };
     assert_eq!((sorted(14_500), sorted(14_600)), (vec![0, 2], vec![0, 1, 2, 3]));
-    let none = event.with(Signal::ScreenGradientAbs, &[7.9e-4; 4]);
-    assert!(run(&Event { step: 14_600, ..none }, "").split.is_empty());
+    let below_tau = event.with(Signal::ScreenGradientAbs, &[7.9e-4; 4]);
+    assert!(run(&Event { step: 14_600, ..below_tau }, "").split.is_empty());
 }
 
 #[test]
@@ -65,7 +65,8 @@ fn rows_are_halved_along_their_longest_axis() {
 
 #[test]
 fn each_view_has_the_same_weight() {
-    // View 1: mean of 1 and 3 is 2: 0.5, 1.5, 0. View 2, a hundred times brighter: 0, 0.5, 1.5.
+    // View 1: the mean of 1 and 3 is 2, so the scores are 0.5, 1.5 and 0. View 2, whose edges are a hundred times as
+    // strong: 0, 0.5 and 1.5.
     let mut score = EdgeScore::default();
     score.add(7, &[1.0, 3.0, 0.0]);
     score.add(7, &[0.0, 100.0, 300.0]);
@@ -89,7 +90,7 @@ fn candidates_are_drawn_in_proportion_to_edge_scores() {
 }
 
 #[test]
-fn the_faint_are_pruned_at_each_growth_and_first_at_step_300() {
+fn faint_rows_are_pruned_at_each_growth_step_and_first_at_step_300() {
     let event = event(300, &[1.0; 4], 100).with(Signal::Opacity, &[0.0199, 0.02, 0.004, f32::NAN]);
     let first = run(&event, "");
     assert_eq!((first.pruned, first.ops.cause.as_str()), (vec![0, 2, 3], "first-prune"));
@@ -104,8 +105,8 @@ fn the_faint_are_pruned_at_each_growth_and_first_at_step_300() {
     // and the one remaining row is split, not the pruned ones, which have stronger edges.
     let budget = 24;
     let edges = vec![view(&[1e9, 1.0, 1e9, 1e9])];
-    let both = Event { step: 600, budget, views: edges, ..event };
-    let both = run(&both, "first_prune_at = 600");
+    let event = Event { step: 600, budget, views: edges, ..event };
+    let both = run(&event, "first_prune_at = 600");
     assert_eq!((both.pruned, both.split), (vec![0, 2, 3], vec![1]));
 }
 
@@ -135,15 +136,15 @@ fn rows_are_split_before_they_are_pruned() {
 
 #[test]
 fn the_last_growth_step_prunes_nothing() {
-    let at = |step, set: &str| {
+    let pruned = |step, set: &str| {
         let faint = event(step, &[0.0; 2], 9).with(Signal::Opacity, &[0.5, 0.004]);
         run(&faint.with_all(Signal::ScreenGradientAbs, 0.0), set).pruned
     };
-    assert_eq!([at(14_800, ""), at(14_900, "")], [vec![1], vec![]]);
-    assert_eq!(at(14_900, "prune_last = true"), [1]);
+    assert_eq!([pruned(14_800, ""), pruned(14_900, "")], [vec![1], vec![]]);
+    assert_eq!(pruned(14_900, "prune_last = true"), [1]);
     // In a shorter run, of 7,000 iterations, growth ends before step 3,500.
     let short = "grow_until = 3500\ngrow_from = 117";
-    assert_eq!([at(3_300, short), at(3_400, short)], [vec![1], vec![]]);
+    assert_eq!([pruned(3_300, short), pruned(3_400, short)], [vec![1], vec![]]);
     // A split row with children of 0.6 · 0.004 is kept, too. NaN is still pruned.
     let split = event(14_900, &[1.0; 2], 9).with(Signal::Opacity, &[0.004, f32::NAN]);
     let done = run(&split, "");
@@ -170,11 +171,11 @@ fn a_fifth_is_pruned_after_each_of_two_resets() {
     let opacity = [0.5, 0.01, 0.4, 0.3, 0.02, 0.2, 0.9, 0.03, 0.8, 0.7];
     let event = event(3300, &[1.0; 10], 10).with(Signal::Opacity, &opacity);
     let done = run(&event, "");
-    // The rows below the quantile, which is at place 0.2 · 9 = 1.8 in ascending order of opacity.
+    // The rows below the quantile, which is at rank 0.2 · 9 = 1.8 in ascending order of opacity.
     assert_eq!(done.pruned, [1, 4]);
     assert_eq!(done.ops.cause, "recovery-prune+grow");
     assert!(!done.ops.reset_signals.is_empty());
-    // Row 1 is below `min_opacity` and is not counted. Of the other nine, two are below place 0.2 · 8 = 1.6.
+    // Row 1 is below `min_opacity` and is not counted. Of the other nine, two are below rank 0.2 · 8 = 1.6.
     let one_dead = opacity.map(|o| if o < 0.015 { 0.001 } else { o });
     let one_dead = event.clone().with(Signal::Opacity, &one_dead);
     assert_eq!(run(&one_dead, "").pruned, [1, 4, 7]);
@@ -194,12 +195,12 @@ fn recovery_prunes_take_their_share_of_the_rows_after_the_splits() {
     // Step 3300: √(2800/14000) = 0.447; ⌊20 · 0.447⌋ = 8: the two of six rows with edges are drawn.
     let opacity = [0.9, 0.1, 0.05, 0.3, 0.4, 0.2];
     let event = event(3300, &[0.0, 1.0, 0.0, 0.0, 1.0, 0.0], 20).with(Signal::Opacity, &opacity);
-    // The opacities are then 0.05, 0.06, 0.06, 0.2, 0.24, 0.24, 0.3, 0.9. The quantile is at place
+    // The opacities are then 0.05, 0.06, 0.06, 0.2, 0.24, 0.24, 0.3, 0.9. The quantile is at rank
     // 0.2 · 7 = 1.4; only row 2 is below the next value, 0.06.
     let done = run(&event, "");
     assert_eq!((done.pruned, done.ops.rows_after), (vec![2], 7));
-    // Place 0.3 · 7 = 2.1: values below 0.2 are pruned, both children of row 1 among them, so row 1 is.
-    // (Place 0.28 · 7 = 1.96 gives 0.06. If children counted once, 0.28 · 5 = 1.4 would give 0.2.)
+    // Rank 0.3 · 7 = 2.1: values below 0.2 are pruned, among them both children of row 1, so row 1 is pruned.
+    // (Rank 0.28 · 7 = 1.96 gives 0.06. If children counted once, 0.28 · 5 = 1.4 would give 0.2.)
     assert_eq!(run(&event, "recovery_share = 0.28").pruned, [2]);
     let more = run(&event, "recovery_share = 0.3");
     assert_eq!((more.pruned, more.split), (vec![1, 2], vec![4]));
@@ -208,7 +209,7 @@ fn recovery_prunes_take_their_share_of_the_rows_after_the_splits() {
 #[test]
 fn the_limit_is_the_first_value_at_or_above_the_quantile() {
     let eleven: Vec<f32> = (0..11_u8).map(f32::from).collect();
-    // At place 2.5 the quantile is between 2 and 3, so the limit is 3.
+    // At rank 2.5 the quantile is between 2 and 3, so the limit is 3.
     let limits: Vec<f32> =
         [0.0, 0.2, 0.25, 1.0].iter().map(|&share| limit_of_share(eleven.clone(), share)).collect();
     assert_eq!(limits, [0.0, 2.0, 3.0, 10.0]);
@@ -220,18 +221,18 @@ fn the_limit_is_the_first_value_at_or_above_the_quantile() {
 
 #[test]
 fn opacities_are_reset_four_times() {
-    let at = |step| run(&event(step, &[1.0], 10), "").ops.clamp_opacity;
+    let limit = |step| run(&event(step, &[1.0], 10), "").ops.clamp_opacity;
     let four = [3000, 6000, 9000, 12_000];
-    assert_eq!(four.map(at), [Some(0.05); 4]);
-    assert_eq!([at(3100), at(14_900)], [None; 2]);
+    assert_eq!(four.map(limit), [Some(0.05); 4]);
+    assert_eq!([limit(3100), limit(14_900)], [None; 2]);
     let scene = Event::new(1, 1, 1).scene;
     let due = |set: &str, scene| {
         due_steps("igs", &format!("grow_every = 0\nfirst_prune_at = 0\n{set}"), scene)
     };
     assert_eq!(due("", &scene), [3000, 3300, 6000, 6300, 9000, 12_000]);
     assert_eq!(due("resets = 2", &scene), [3000, 3300, 6000, 6300]);
-    let all = "resets = 9\nrecoveries = 9";
-    assert_eq!(due(all, &scene), [3000, 3300, 6000, 6300, 9000, 9300, 12_000, 12_300]);
+    let nine = "resets = 9\nrecoveries = 9";
+    assert_eq!(due(nine, &scene), [3000, 3300, 6000, 6300, 9000, 9300, 12_000, 12_300]);
     // No recovery prune without a reset.
     assert_eq!(due("resets = 1\nrecoveries = 9", &scene), [3000, 3300]);
     assert_eq!(due("recovery_share = 0", &scene), four);
@@ -249,9 +250,9 @@ fn all_views_are_rendered_after_a_recovery_prune() {
         (0..=30_000).filter(|&step| policy.aux_views(step, 1, 9) == count).collect()
     };
     assert_eq!(views(u32::MAX), [3400, 6400]);
-    // 600..14,500 except these two.
-    let some = views(10);
-    assert_eq!((some.len(), some[0], some.last()), (138, 600, Some(&14_500)));
+    // The growth steps from 600 to 14,500 except these two.
+    let ten_views = views(10);
+    assert_eq!((ten_views.len(), ten_views[0], ten_views.last()), (138, 600, Some(&14_500)));
 }
 
 #[test]
@@ -294,12 +295,12 @@ fn optimiser_steps(set: &str, iterations: u32) -> [usize; 2] {
 
 #[test]
 fn the_number_of_optimiser_steps_is_kept_in_short_runs() {
-    // 7500/5 and 7500/20; a run twice as long has sums of 10 and 40.
+    // 7500/5 and 7500/20; a run twice as long sums over 10 and 40 iterations.
     assert_eq!(optimiser_steps("", 30_000), [1500, 375]);
     assert_eq!(optimiser_steps("", 60_000), [1500, 375]);
     // 7,000: 5 · 7/30 = 1.17, 20 · 7/30 = 4.67, so 1 and 5: 1750 and 350.
     assert_eq!(optimiser_steps("", 7000), [1750, 350]);
-    // 1.33 becomes 1: a step at every iteration.
+    // 20 · 2/30 = 1.33 becomes 1: an optimiser step at every iteration.
     assert_eq!(optimiser_steps("", 2000), [500, 500]);
     assert_eq!(optimiser_steps("", 4), [1, 1]);
     // As published: 1,750/5, and the multiples of 20 from 5,260 to 7,000.

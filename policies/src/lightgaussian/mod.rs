@@ -10,7 +10,7 @@
 //! ## Method
 //!
 //! **Growth** is that of `vanilla`, with its parameters: clones and splits by screen gradient, pruning by
-//! opacity and size, opacity resets, and a hard stop at the budget (or `governor`). It ends at
+//! opacity and size, opacity resets, and a hard stop at the budget (with `governor`, a growth curve). It ends at
 //! `grow_until`, before the first prune.
 //!
 //! **Pruning.** With `schedule = "twice"`, the share `first_share` of all Gaussians is pruned at step
@@ -25,7 +25,7 @@
 //! if both prunes fall on one step, only the first takes place.
 //!
 //! - `hit` is the contribution of a pixel: `opacity`, the opacity o, as in the published code; or
-//!   `blend-weight`, the Gaussian's weight α·T there, so that a Gaussian hidden behind others counts less.
+//!   `blend-weight`, the Gaussian's weight α·T in the pixel, so that a Gaussian hidden behind others counts less.
 //!   The paper uses the opacity times the transmittance T; the blend weight also falls off towards the
 //!   Gaussian's edge. The published figures are for `opacity`, the default.
 //! - `volume` is V: `plain`, as in the published code; or `clipped`, as in the paper, min(V / V90, 1),
@@ -37,14 +37,14 @@
 //!
 //! The budget bounds growth and is never exceeded. Nothing grows after the prunes, so a run ends far below
 //! it: with the defaults at 0.5 · 0.6 = 30 % of the grown model, with `once` at 34 %. Other policies end
-//! with three times as many Gaussians at the same budget, so also compare at equal final numbers.
+//! with three times as many Gaussians at the same budget, so also compare at equal final numbers of Gaussians.
 //!
 //! ## Differences from the published code
 //!
 //! - The published code divides V by a volume V_ref that 90 % of the Gaussians exceed. V_ref is the same for
 //!   all Gaussians and does not change their order, so it is left out.
-//! - ⌊share · N⌋ of N Gaussians are pruned; the published code also prunes those of equal significance.
-//!   The last Gaussian is never pruned.
+//! - ⌊share · N⌋ of N Gaussians are pruned; the published code also prunes the others whose
+//!   significance is that of the last pruned one. The last Gaussian is never pruned.
 //! - Training views that nearly duplicate another are not rendered (`--full` renders all).
 //! - The published pipeline continues with distilled spherical harmonics and quantised vectors. They reduce
 //!   the file size of a finished model and are not part of density control.
@@ -59,7 +59,7 @@
 //! | grow_until | 15000 | >= 0 | step | end of growth, of pruning by opacity and of opacity resets (exclusive) |
 //! | grow_every | 100 | >= 0 | steps | interval of growth; 0: never |
 //! | tau | 0.0002 | >= 0 | 1 / NDC | screen gradient from which a Gaussian is densified |
-//! | small | 0.01 | >= 0 | scene extent | largest size that is cloned; larger ones are split |
+//! | small | 0.01 | >= 0 | scene extent | Gaussians up to this size are cloned, larger ones split |
 //! | split_factor | 1.6 | 1 to 100 | | a split divides the scales by this |
 //! | min_opacity | 0.005 | 0 to 1 | | Gaussians below this opacity are pruned during growth |
 //! | max_scale | 0.1 | > 0 | scene extent | Gaussians above this size are pruned during growth |
@@ -70,12 +70,12 @@
 //! | governor | false | | | grow along a curve instead of by `tau` |
 //! | schedule | "twice" | twice, once | | number of prunes |
 //! | first_at | 16000 | >= 0 | step | first prune of `twice`; 0: none |
-//! | first_share | 0.5 | 0 to 1 | Gaussians | share that it removes |
+//! | first_share | 0.5 | 0 to 1 | Gaussians | share that the first prune removes |
 //! | second_at | 24000 | >= 0 | step | second prune of `twice`; 0: none |
-//! | second_share | 0.4 | 0 to 1 | Gaussians | share that it removes |
+//! | second_share | 0.4 | 0 to 1 | Gaussians | share that the second prune removes |
 //! | once_at | 20000 | >= 0 | step | the prune of `once`; 0: none |
-//! | once_share | 0.66 | 0 to 1 | Gaussians | share that it removes |
-//! | victims | "lowest" | lowest, random | | which Gaussians are pruned |
+//! | once_share | 0.66 | 0 to 1 | Gaussians | share that the prune of `once` removes |
+//! | victims | "lowest" | lowest, random | | which Gaussians are pruned: the least significant or random ones |
 //! | hit | "opacity" | opacity, blend-weight | | contribution of a pixel to the significance |
 //! | volume | "plain" | plain, clipped | | volume V in the significance |
 //! | volume_power | 0.1 | 0 to 1 | | power β of the volume; 0: the volume is ignored |
@@ -111,7 +111,7 @@ crate::register_policy!(
 pub struct LightGaussian {
     params: LightGaussianParams,
     growth: Vanilla,
-    /// Number of pixels or blend weights, summed over the views of the event. Shape: `[rows]`.
+    /// Numbers of pixels or sums of blend weights, summed over the views of the event. Shape: `[rows]`.
     hits: ViewAccumulator,
 }
 
@@ -221,13 +221,13 @@ impl LightGaussian {
 /// The 90th percentile: of n values in descending order, the one after the first ⌊n / 10⌋. Infinite if there
 /// are no values.
 fn percentile_90(volume: &[f32]) -> f32 {
-    let mut sorted = volume.to_vec();
-    let larger = sorted.len() / 10;
-    if larger >= sorted.len() {
+    let mut volumes = volume.to_vec();
+    let larger_count = volumes.len() / 10;
+    if larger_count >= volumes.len() {
         return f32::INFINITY;
     }
     let descending = |a: &f32, b: &f32| b.total_cmp(a);
-    *sorted.select_nth_unstable_by(larger, descending).1
+    *volumes.select_nth_unstable_by(larger_count, descending).1
 }
 
 #[cfg(test)]

@@ -47,12 +47,12 @@ fn the_blend_weight_is_not_multiplied_by_the_opacity() {
     event.views = vec![view(&[9.0; 3], &[1.0, 2.0, 4.0]), view(&[9.0; 3], &[2.0, 0.0, 0.0])];
     assert_eq!(run(&event, "hit = \"blend-weight\"\nfirst_share = 0.34").pruned, [1]);
     assert_eq!(run(&event, "hit = \"blend-weight\"\nfirst_share = 0.67").pruned, [0, 1]);
-    // By opacity: 9, 16.2, 1.8.
+    // With the default `hit`, pixels · opacity: 9, 16.2, 1.8.
     assert_eq!(run(&event, "first_share = 0.34").pruned, [2]);
 }
 
 #[test]
-fn volume_counts_by_its_tenth_root() {
+fn significance_grows_with_the_tenth_root_of_the_volume() {
     // Volumes 1 and 1024: factors 1 and 1024^0.1 = 2. Pixels · ½ · factor: 5, 4.5·2 = 9, 4, 2.45·2 = 4.9.
     let mut event = event(16_000, 4).with(Signal::ScaleProduct, &[1.0, 1024.0, 1.0, 1024.0]);
     event.views = vec![view(&[10.0, 9.0, 8.0, 4.9], &[0.0; 4])];
@@ -63,7 +63,7 @@ fn volume_counts_by_its_tenth_root() {
     // Without the volume: 10, 9, 8, 4.9.
     assert_eq!(pruned("first_share = 0.5\nvolume_power = 0"), [2, 3]);
     assert_eq!(pruned("first_share = 0.25\nvolume_power = 0"), [3]);
-    // The volume itself: 5, 4608, 4, 2508.8.
+    // With the volume itself as the factor: 5, 4608, 4, 2508.8.
     assert_eq!(pruned("first_share = 0.5\nvolume_power = 1"), [0, 2]);
 }
 
@@ -87,19 +87,19 @@ fn the_largest_tenth_of_volumes_is_clipped() {
     volume[8] = 64_f32.powi(10);
     volume[9] = 128_f32.powi(10);
     let event = event(16_000, 20).with(Signal::ScaleProduct, &volume);
-    let at = |set: &str| {
+    let factors = |set: &str| {
         let all = significance(&event, set, &[2.0; 20]);
         [6, 7, 8, 9].map(|row: usize| (all[row] * 1e4).round() / 1e4)
     };
-    assert_eq!(at(""), [1.0, 32.0, 64.0, 128.0]);
-    assert_eq!(at("volume = \"clipped\""), [1.0, 32.0, 32.0, 32.0]);
+    assert_eq!(factors(""), [1.0, 32.0, 64.0, 128.0]);
+    assert_eq!(factors("volume = \"clipped\""), [1.0, 32.0, 32.0, 32.0]);
     assert_eq!(percentile_90(&[1.0, 3.0, 2.0]), 3.0);
     assert_eq!(percentile_90(&[1.0, 9.0, 3.0, 2.0, 0.0, 0.0, 0.0, 0.0, 8.0, 0.0]), 8.0);
     assert!(percentile_90(&[]).is_infinite());
 }
 
 #[test]
-fn nan_has_no_significance() {
+fn rows_with_nan_have_no_significance() {
     let event = event(16_000, 3).with(Signal::ScaleProduct, &[1.0, f32::NAN, 1.0]);
     assert_eq!(significance(&event, "", &[f32::NAN, 4.0, 4.0]), [0.0, 0.0, 2.0]);
 }
@@ -107,18 +107,18 @@ fn nan_has_no_significance() {
 #[test]
 fn the_published_shares_leave_30_percent() {
     // 1,000 → 500 → 300, the second share being 0.5·0.8; once: 1,000 → 340.
-    let at = |step, rows: usize, set: &str| {
+    let rows_after = |step, rows: usize, set: &str| {
         let mut event = event(step, rows);
         event.views = vec![view(&vec![1.0; rows], &vec![1.0; rows])];
         run(&event, set).ops.rows_after
     };
-    assert_eq!([at(16_000, 1000, ""), at(24_000, 500, "")], [500, 300]);
-    assert_eq!(at(20_000, 1000, "schedule = \"once\""), 340);
+    assert_eq!([rows_after(16_000, 1000, ""), rows_after(24_000, 500, "")], [500, 300]);
+    assert_eq!(rows_after(20_000, 1000, "schedule = \"once\""), 340);
     // ⌊0.5·7⌋ = 3.
-    assert_eq!(at(16_000, 7, ""), 4);
+    assert_eq!(rows_after(16_000, 7, ""), 4);
     // The last row is kept.
-    assert_eq!(at(16_000, 7, "first_share = 1.0"), 1);
-    assert_eq!(at(16_000, 1, ""), 1);
+    assert_eq!(rows_after(16_000, 7, "first_share = 1.0"), 1);
+    assert_eq!(rows_after(16_000, 1, ""), 1);
 }
 
 #[test]

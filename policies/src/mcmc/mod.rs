@@ -15,7 +15,7 @@
 //!    living Gaussian, drawn with replacement in proportion to opacity.
 //! 2. The model grows by the factor 1 + `growth`, up to the budget, by further copies drawn in the same
 //!    way. An event that replaces n events of the published code grows by (1 + `growth`)ⁿ; n is 1 in a run of 30,000
-//!    with the default `grow_every`.
+//!    steps with the default `grow_every`.
 //!
 //! A Gaussian drawn n times becomes N = n + 1 equal ones that together render like the original. Each
 //! has the opacity o′ = 1 − (1 − o)^(1/N), at least `min_opacity`, and standard deviations multiplied
@@ -45,10 +45,10 @@
 //!   of dead Gaussians.
 //! - The published `noise` and `scale_term` depend on the unit of length. Here the unit is the camera
 //!   radius (scene extent / 1.1), as in gsplat's normalised scenes.
-//! - The published code grows by 5 % every 100 steps: 244 events, ×150,000. A run of 2,000 has 16 events;
-//!   at 5 % each they would only double the model, whatever the budget. `growth` is therefore per 100 steps
-//!   of a run of 30,000, and each event applies it n = `grow_every` · 300 / iterations times: 15 times in a
-//!   run of 2,000, where each event doubles the model.
+//! - The published code grows by 5 % every 100 steps: 244 events multiply the model by up to 150,000. A run of
+//!   2,000 steps has 16 events; at 5 % each they would only double the model, whatever the budget. `growth` is
+//!   therefore per 100 steps of a run of 30,000, and each event applies it n = `grow_every` · 300 / iterations
+//!   times: 15 times in a run of 2,000, so that each event doubles the model.
 //! - If no Gaussian is alive, nothing happens.
 //!
 //! ## Parameters
@@ -218,8 +218,8 @@ impl DensityPolicy for Mcmc {
 
     fn plan(&mut self, now: &Snapshot<'_>, rng: &PolicyRng, plan: &mut EditPlan) -> PolicyResult {
         let opacity = now.signal(Signal::Opacity)?;
-        let least = self.params.min_opacity as f32;
-        let is_alive = |opacity: f32| opacity.is_finite() && opacity > least;
+        let min_opacity = self.params.min_opacity as f32;
+        let is_alive = |opacity: f32| opacity.is_finite() && opacity > min_opacity;
         let weights: Vec<f32> =
             opacity.iter().map(|&o| if is_alive(o) { o } else { 0.0 }).collect();
         let dead: Vec<u32> =
@@ -261,9 +261,9 @@ impl Mcmc {
     fn copies(&self, opacity: f32, copies: u32) -> Offspring {
         let members = copies.saturating_add(1);
         let counted = members.min(self.params.most_shares);
-        let least = self.params.min_opacity;
-        let (share, scale) = share(f64::from(opacity), counted, least);
-        let is_exact = counted == members && share > least;
+        let min_opacity = self.params.min_opacity;
+        let (share, scale) = share(f64::from(opacity), counted, min_opacity);
+        let is_exact = counted == members && share > min_opacity;
         Offspring {
             children: copies,
             parent: ParentFate::BecomesChild,
@@ -278,7 +278,7 @@ impl Mcmc {
 /// The opacity, at least `least`, of each of `members` equal rows that replace one of opacity
 /// `opacity`, and the factor on their standard deviations.
 fn share(opacity: f64, members: u32, least: f64) -> (f64, f64) {
-    // The largest number below 1 as an f32.
+    // Just below 1, also as an f32.
     let most = 1.0 - f64::from(f32::EPSILON);
     let opacity = opacity.clamp(0.0, most);
     let share = (1.0 - (1.0 - opacity).powf(1.0 / f64::from(members))).clamp(least, most);

@@ -12,7 +12,7 @@ fn event(opacity: &[f32], budget: usize) -> Event {
     Event::new(600, opacity.len(), budget).with(Signal::Opacity, opacity)
 }
 
-/// The double sum as printed in the paper.
+/// The denominator of the scale factor (equation 9), as the double sum that the paper prints.
 fn denominator(share: f64, members: u32) -> f64 {
     let binomial =
         |n: u32, k: u32| (0..k).fold(1.0, |c, i| c * f64::from(n - i) / f64::from(i + 1));
@@ -67,7 +67,7 @@ fn the_dead_are_relocated_to_the_only_living_row() {
     assert!((f64::from(scale) - share(0.5, 4, 0.005).1).abs() < 1e-6);
     assert_eq!(done.ops.counts, EditCounts { removed: 3, added: 3, updated: 1, denied: 0 });
     assert_eq!((done.ops.rows_after, done.ops.cause.as_str()), (4, "relocate"));
-    // Opacity 0.0051 is alive.
+    // A row of opacity 0.0051 is alive.
     assert_eq!(run(&event(&[0.0051, 0.5], 2), "").pruned, [0_u32; 0]);
 }
 
@@ -121,7 +121,7 @@ fn extreme_growth_fills_the_budget_and_no_more() {
     for (growth, every) in [(0.0, u32::MAX), (0.5, 0)] {
         assert_eq!(grown_rows(3, growth_of_event(growth, every, 1)), 3);
     }
-    // Exactly as published.
+    // With the published interval and run length, the growth is exactly the published one.
     for growth in [0.0, 0.05, 0.1, 1.0] {
         assert_eq!(growth_of_event(growth, 100, 30_000).to_bits(), (1.0 + growth).to_bits());
     }
@@ -132,18 +132,18 @@ fn runs_of_2_000_steps_fill_their_budget() {
     let scene = SceneInfo { iterations: 2000, ..Event::new(1, 1, 1).scene };
     let mut policy = build("mcmc", "", &scene);
     // From 100 rows, 2.0789-fold at each event: 207, 430, 893, 1856, 3858, 8020, then the budget.
-    let (mut rows, mut seen) = (100, Vec::new());
+    let (mut rows, mut sizes) = (100, Vec::new());
     for step in (1..=2000).filter(|&step| build("mcmc", "", &scene).is_due(step)) {
         let event = Event { step, ..event(&vec![0.5; rows], 10_000) };
         rows = event.run_policy(&mut *policy).unwrap().ops.rows_after;
-        seen.push(rows);
+        sizes.push(rows);
     }
-    assert_eq!(seen.len(), 16);
-    assert_eq!(seen[..8], [207, 430, 893, 1856, 3858, 8020, 10_000, 10_000]);
+    assert_eq!(sizes.len(), 16);
+    assert_eq!(sizes[..8], [207, 430, 893, 1856, 3858, 8020, 10_000, 10_000]);
 }
 
 #[test]
-fn every_group_has_its_published_rate() {
+fn every_parameter_has_its_published_rate() {
     let scene = Event::new(1, 1, 1).scene;
     let rates = build("mcmc", "", &scene).needs(&scene).rates;
     let start_end = |rate: Option<Rate>| rate.map(|rate| (rate.start, rate.end));

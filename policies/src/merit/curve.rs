@@ -1,4 +1,4 @@
-//! The number of new rows per event: those that the curve allows and those that replace others.
+//! The number of new rows per event: the rows that the curve allows and those that replace others.
 
 use super::{Merit, MeritParams};
 use crate::plan::EditPlan;
@@ -21,7 +21,7 @@ impl Merit {
     /// within the limits of `rho` and `most_rho`.
     pub(super) fn turnover(&self, now: &Snapshot<'_>, plan: &EditPlan) -> PolicyResult<usize> {
         let MeritParams { rho, most_rho, replaceable, .. } = self.params;
-        let part = |share| event_quota(share, self.events, now.step, plan.budget());
+        let quota = |share| event_quota(share, self.events, now.step, plan.budget());
         let importance = now.signal(Signal::WeightMax)?;
         let limit = replaceable as f32 * median(importance);
         let age = self.ages(now)?;
@@ -29,16 +29,16 @@ impl Merit {
             plan.is_free(row) && self.is_old(age, row) && importance[row as usize] < limit
         };
         let unimportant = (0..now.rows() as u32).filter(is_unimportant).count();
-        Ok(unimportant.min(part(most_rho)).max(part(rho)))
+        Ok(unimportant.min(quota(most_rho)).max(quota(rho)))
     }
 }
 
 /// The upper median of the finite values; 0 if there are none.
 fn median(values: &[f32]) -> f32 {
-    let mut numbers: Vec<f32> = values.iter().copied().filter(|value| value.is_finite()).collect();
-    let middle = numbers.len() / 2;
-    if numbers.is_empty() {
+    let mut finite: Vec<f32> = values.iter().copied().filter(|value| value.is_finite()).collect();
+    let middle = finite.len() / 2;
+    if finite.is_empty() {
         return 0.0;
     }
-    *numbers.select_nth_unstable_by(middle, f32::total_cmp).1
+    *finite.select_nth_unstable_by(middle, f32::total_cmp).1
 }

@@ -1,7 +1,7 @@
 //! # merit — replaces all hardly visible Gaussians
 //!
-//! Fills the budget slowly and keeps replacing: Gaussians that are hardly visible in any view make room for
-//! children of Gaussians that have large gradients in several views. The number of replacements adapts to
+//! Fills the budget slowly and keeps replacing Gaussians: those that are hardly visible in any view make room for
+//! children of those with large gradients in several views. The number of replacements adapts to
 //! the scene: the more Gaussians are badly placed, the more are replaced.
 //!
 //! Source: our own; docs/comparison.md has the figures. The turnover, the gradient with its colour term and the
@@ -32,7 +32,7 @@
 //!
 //! **Pruning.** Gaussians below `min_opacity` are pruned. If there is no room for new Gaussians, the least
 //! important ones that are not parents are pruned. Newborns (younger than an epoch, at most `protect` steps)
-//! are pruned only if there are no others, the oldest first.
+//! are pruned only if there are too few others, the oldest first.
 //!
 //! **Children.** A Gaussian larger than `small` is split along its longest axis: with d = `split_share`, two
 //! halves at ±3d standard deviations, their longest axis 1 − d times the parent's, the others √(1 − d²) times,
@@ -54,10 +54,10 @@
 //! | most_rho | 2.0 | >= 0 | budget | maximum number of Gaussians replaced in the whole run |
 //! | gradient | "abs" | abs, screen | | screen gradient, with absolute values or without |
 //! | colour_weight | 30.0 | >= 0 | | weight of the colour gradient; 0: none |
-//! | full_depth | 0.8 | >= 0 | scene extent | nearer views count less in g; 0: all count equally |
+//! | full_depth | 0.8 | >= 0 | scene extent | depth below which a view counts less in g; 0: all count equally |
 //! | least_views | 3 | >= 0 | views | minimum number of views in which a parent is seen |
 //! | protect | 100 | 0 to 65535 | steps | longest protection of newborns; 0: none |
-//! | small | 0.01 | >= 0 | scene extent | largest size that is cloned; 0: all are split |
+//! | small | 0.01 | >= 0 | scene extent | Gaussians up to this size are cloned, larger ones split; 0: all are split |
 //! | split_share | 0.45 | 0 to 1, both excluded | | d of the split |
 //! | child_opacity | 0.6 | 0 to 1, 0 excluded | | factor on the opacity in a split |
 //! | min_opacity | 0.005 | 0 to 1 | | Gaussians below this opacity are pruned |
@@ -146,9 +146,9 @@ impl DensityPolicy for Merit {
     fn plan(&mut self, now: &Snapshot<'_>, _rng: &PolicyRng, plan: &mut EditPlan) -> PolicyResult {
         plan.cause("grow");
         let opacity = now.signal(Signal::Opacity)?;
-        let least = self.params.min_opacity as f32;
+        let min_opacity = self.params.min_opacity as f32;
         // False for NaN.
-        let is_alive = |row: u32| opacity[row as usize] >= least;
+        let is_alive = |row: u32| opacity[row as usize] >= min_opacity;
         let mut dead: Vec<u32> = (0..now.rows() as u32).filter(|&row| !is_alive(row)).collect();
         spare_one(&mut dead, opacity);
         plan.prune_all(dead);
@@ -198,16 +198,16 @@ impl Merit {
     ) -> PolicyResult<Vec<u32>> {
         let gradient = self.gradient(now)?;
         let views = now.signal(Signal::VisibleCount)?;
-        let least = self.params.least_views as f32;
+        let least_views = self.params.least_views as f32;
         let is_eligible = |row: &u32| {
             let index = *row as usize;
-            plan.is_free(*row) && gradient[index] > 0.0 && views[index] >= least
+            plan.is_free(*row) && gradient[index] > 0.0 && views[index] >= least_views
         };
         let rows: Vec<u32> = (0..now.rows() as u32).filter(is_eligible).collect();
         Ok(largest(rows, &gradient, births))
     }
 
-    /// Prunes the `count` least important rows that are not parents; newborns only if there are no others,
+    /// Prunes the `count` least important rows that are not parents; newborns only if there are too few others,
     /// the oldest first.
     fn prune_least(
         &self,

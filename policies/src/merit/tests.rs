@@ -83,21 +83,21 @@ fn all_unimportant_rows_are_replaced() {
     opacity[0] = 0.004;
     let faint = run(&event.clone().with(Signal::Opacity, &opacity), set);
     assert_eq!((faint.pruned, faint.ops.rows_after), (vec![0, 1, 2], 20));
-    // NaN is not below the limit and not part of the median: the fifth of nine is 1.0.
+    // NaN is neither below the limit nor part of the median: the fifth of nine values is 1.0.
     importance[9..].fill(f32::NAN);
     assert_eq!(run(&event.with(Signal::WeightMax, &importance), set).pruned, [0, 1, 2]);
 }
 
 #[test]
 fn the_least_important_rows_that_are_not_parents_are_pruned() {
-    // The two with the largest gradients are the least important too.
+    // The two rows with the largest gradients are also the least important.
     let mut gradient = vec![0.1; 6];
     gradient[..2].copy_from_slice(&[5.0, 6.0]);
     let event = event(600, 6, 6).with(Signal::ScreenGradientAbs, &gradient);
     // 48 · 6 / 144 = 2.
     let done = run(&event, "rho = 48.0");
     assert_eq!((done.pruned, done.cloned), (vec![2, 3], vec![1, 0]));
-    // Newborns only if there are no others, the oldest first.
+    // Newborns are pruned only if there are too few others, the oldest first.
     let young = event.with(Signal::Age, &[500.0, 500.0, 10.0, 30.0, 20.0, 200.0]);
     assert_eq!(run(&young, "rho = 48.0").pruned, [3, 5]);
     // With an epoch of ten steps all rows are old.
@@ -113,14 +113,14 @@ fn parents_are_ranked_by_mean_screen_and_colour_gradients() {
         .with(Signal::ScreenGradientAbs, &[4.0, 1.5, 8.0, 0.0])
         .with(Signal::ScreenGradient, &[0.1, 0.0, 0.0, 0.9])
         .with(Signal::ColourGradient, &[0.0, 0.06, 0.0, 0.0]);
-    let one = |set: &str| run(&event, &format!("curve_until = 8500\n{set}")).cloned;
-    assert_eq!(one("colour_weight = 30.0"), [1]);
-    assert_eq!(one(""), [0]);
-    assert_eq!(one("least_views = 0"), [2]);
-    assert_eq!(one("gradient = \"screen\""), [3]);
-    let more = Event { budget: 9, ..event.clone() };
+    let parent = |set: &str| run(&event, &format!("curve_until = 8500\n{set}")).cloned;
+    assert_eq!(parent("colour_weight = 30.0"), [1]);
+    assert_eq!(parent(""), [0]);
+    assert_eq!(parent("least_views = 0"), [2]);
+    assert_eq!(parent("gradient = \"screen\""), [3]);
+    let roomy = Event { budget: 9, ..event.clone() };
     // A row without a gradient has no children.
-    let all = run(&more, "curve_until = 8500\nleast_views = 0").cloned;
+    let all = run(&roomy, "curve_until = 8500\nleast_views = 0").cloned;
     assert_eq!(all, [2, 0, 1]);
 }
 

@@ -12,12 +12,12 @@
 //! A Gaussian dominates a pixel if no other has a larger blend weight there. One that dominates more than
 //! `dominant_share` of a view's pixels, in any view since the last growth step, covers a whole area and mostly
 //! blurs it, so it is split. (Published as more than H·W/5000 pixels.) These splits follow those of `vanilla`,
-//! the largest share first while there is room.
+//! those with the largest share first, while there is room.
 //!
 //! **Re-initialisation** at the steps `first_reinit_at` and `second_reinit_at`: the whole model is replaced by
 //! surface points, at most `reinit_share` of the budget, drawn from the pixels of all training views in
 //! proportion to accumulated alpha. The size of a new Gaussian is the root mean square distance to its three
-//! nearest neighbours, its opacity `restart_opacity`. Nothing else grows at these steps.
+//! nearest neighbours, and its opacity is `restart_opacity`. Nothing else grows at these steps.
 //!
 //! **Sampling** at step `sample_at`. A Gaussian's importance is the sum of its blend weights α·T over all pixels
 //! of all training views, or 0 if it dominates no pixel. (`importance` = "density" divides each view's sum by the
@@ -62,7 +62,7 @@
 //! | grow_until | 15000 | >= 0 | step | end of growth (exclusive) |
 //! | grow_every | 100 | >= 0 | steps | interval of growth; 0: never |
 //! | tau | 0.0002 | >= 0 | 1 / NDC | screen gradient from which a Gaussian is densified |
-//! | small | 0.01 | >= 0 | scene extent | largest size that is cloned; larger ones are split |
+//! | small | 0.01 | >= 0 | scene extent | Gaussians up to this size are cloned, larger ones split |
 //! | split_factor | 1.6 | 1 to 100 | | a split divides the scales by this |
 //! | min_opacity | 0.005 | 0 to 1 | | Gaussians below this opacity are pruned during growth |
 //! | max_scale | 0.1 | > 0 | scene extent | Gaussians above this size are pruned during growth |
@@ -75,7 +75,7 @@
 //! | first_reinit_at | 5000 | >= 0 | step | first re-initialisation; 0: none |
 //! | second_reinit_at | 10000 | >= 0 | step | second re-initialisation; 0: none |
 //! | reinit_share | 0.8 | 0 to 1, 0 excluded | budget | maximum number of Gaussians after a re-initialisation |
-//! | sample_at | 15000 | >= 0 | step | sampling; 0: none |
+//! | sample_at | 15000 | >= 0 | step | the sampling; 0: none |
 //! | sample_share | 0.5 | 0 to 1 | Gaussians | share of the Gaussians with an importance above 0 that is kept |
 //! | importance | "sum" | sum, density | | sum of blend weights in a view, or their mean over the Gaussian's pixels |
 //! | restart_opacity | 0.1 | 0 to 1, both excluded | | opacity of new and restarted Gaussians |
@@ -124,7 +124,7 @@ pub struct MiniSplatting {
     /// zero.
     surface: Vec<Candidate>,
     importance: ViewAccumulator,
-    /// Number of pixels that each row dominates.
+    /// Number of pixels that each row dominates in the views of the current event.
     dominated: ViewAccumulator,
 }
 
@@ -262,18 +262,18 @@ impl MiniSplatting {
         // No view was measured, so nothing is pruned.
         let Some(importance) = self.importance(now) else { return Ok(()) };
         let positions = now.positions()?;
-        let is_sound = |row: usize| positions[row].iter().all(|x| x.is_finite());
+        let is_valid = |row: usize| positions[row].iter().all(|x| x.is_finite());
         let importance: Vec<f32> =
-            (0..now.rows()).map(|row| if is_sound(row) { importance[row] } else { 0.0 }).collect();
+            (0..now.rows()).map(|row| if is_valid(row) { importance[row] } else { 0.0 }).collect();
         let important = importance.iter().filter(|value| **value > 0.0).count();
         let count = (self.params.sample_share * important as f64).floor() as usize;
-        let chances = match self.params.victims {
+        let weights = match self.params.victims {
             Victims::Lowest => importance,
             Victims::Random => {
-                (0..now.rows()).map(|row| if is_sound(row) { 1.0 } else { 0.0 }).collect()
+                (0..now.rows()).map(|row| if is_valid(row) { 1.0 } else { 0.0 }).collect()
             }
         };
-        let mut kept = weighted(&chances, count.max(1), rng);
+        let mut kept = weighted(&weights, count.max(1), rng);
         if kept.is_empty() {
             return Ok(());
         }
@@ -296,10 +296,10 @@ impl MiniSplatting {
         let total: f64 = importance.iter().map(|&value| f64::from(value)).sum();
         let mut ascending: Vec<f64> = importance.iter().map(|&value| f64::from(value)).collect();
         ascending.sort_unstable_by(f64::total_cmp);
-        let mut left = (1.0 - self.params.cut_mass) * total;
+        let mut prunable = (1.0 - self.params.cut_mass) * total;
         let pruned = ascending.iter().take_while(|&&value| {
-            left -= value;
-            left >= 0.0
+            prunable -= value;
+            prunable >= 0.0
         });
         let count = pruned.count();
         self.params.victims.prune(plan, &importance, count, rng);

@@ -63,11 +63,11 @@ impl Default for MiniSplattingParams {
 impl MiniSplattingParams {
     /// Checks the ranges of the parameters that are not `vanilla`'s.
     pub(super) fn check(&self) -> PolicyResult {
-        let inside = (Excluded(0.0), Excluded(1.0));
+        let open_unit = (Excluded(0.0), Excluded(1.0));
         in_range("dominant_share", self.dominant_share, 0.0..=1.0)?;
         in_range("reinit_share", self.reinit_share, (Excluded(0.0), Included(1.0)))?;
         in_range("sample_share", self.sample_share, 0.0..=1.0)?;
-        in_range("restart_opacity", self.restart_opacity, inside)?;
+        in_range("restart_opacity", self.restart_opacity, open_unit)?;
         in_range("cut_mass", self.cut_mass, 0.0..=1.0)?;
         in_range("opacity_rate", self.opacity_rate, (Excluded(0.0), Unbounded))
     }

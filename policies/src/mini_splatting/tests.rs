@@ -50,7 +50,7 @@ fn dominant_rows_are_split() {
 fn the_schedule_is_the_published_one() {
     let scene = Event::new(1, 1, 1).scene;
     let steps = due_steps("mini-splatting", "", &scene);
-    // Growth from 600 to 14,900, sampling, the cut.
+    // Growth from 600 to 14,900, the sampling, the cut.
     assert_eq!((steps.len(), steps[0], &steps[143..]), (146, 600, &[14_900, 15_000, 20_000][..]));
     let policy = build("mini-splatting", "", &scene);
     let all: Vec<u32> =
@@ -116,8 +116,8 @@ fn half_of_the_rows_with_an_importance_are_kept_and_restarted() {
 }
 
 #[test]
-fn importance_may_be_counted_per_pixel() {
-    // Sums 1e6 and 1; per pixel 1e-6 and 1.
+fn importance_may_be_averaged_over_pixels() {
+    // The sums are 1e6 and 1; per pixel they are 1e-6 and 1.
     let mut event = event(15_000, 2);
     event.views = vec![view(&[1e6, 1.0], &[1e12, 1.0], &[1.0, 1.0])];
     assert_eq!(run(&event, "").pruned, [1]);
@@ -147,9 +147,9 @@ fn the_control_keeps_the_same_number_at_random() {
     assert!(real.ops.updates.iter().all(|(row, _)| *row < 300));
     let control = run(&event, "victims = \"random\"");
     assert_eq!(control.ops.rows_after, 150);
-    // 0.3 · 150 of them have an importance by chance: 45 ± 5·5.2 (hypergeometric).
-    let low = control.ops.updates.iter().filter(|(row, _)| *row < 300).count();
-    assert!(low.abs_diff(45) < 26, "{low}");
+    // By chance, 0.3 · 150 of the kept rows have an importance: 45 ± 5·5.2 (hypergeometric).
+    let important = control.ops.updates.iter().filter(|(row, _)| *row < 300).count();
+    assert!(important.abs_diff(45) < 26, "{important}");
 }
 
 #[test]

@@ -22,7 +22,7 @@ pub struct Needs {
     /// Per-row statistics.
     pub signals: SignalSet,
     /// Camera depth z₀ `[scene units]`, >= 0, below which a view counts less in the signals of screen
-    /// and colour gradients: it is weighted by min(1, z/z₀)², z the depth of the row's mean. 0: all
+    /// and colour gradients: it is weighted by min(1, z/z₀)², where z is the depth of the row's mean. 0: all
     /// views count equally.
     ///
     /// Gaussians near a camera have large screen gradients but appear in few other views; growing them
@@ -42,7 +42,7 @@ pub struct Needs {
     pub noise: Option<NoiseTerm>,
     /// A learned mask per row, if any.
     pub mask: Option<MaskTerm>,
-    /// Longest [cadence](crate::policy::DensityPolicy::cadence) of the run. Above 1, gradients are
+    /// Longest [cadence](crate::policy::DensityPolicy::cadence) of the run. If above 1, gradients are
     /// summed between optimiser steps, and the sums need memory.
     pub cadence: Cadence,
     /// Smallest [factor](crate::policy::DensityPolicy::resolution) on the sides of training images in the run,
@@ -52,7 +52,7 @@ pub struct Needs {
     pub rates: RateOverrides,
     /// Changes to the initial rows.
     pub start: StartRule,
-    /// True if plans hold edits that take more memory: rows rewritten in place
+    /// True if plans may hold edits that take more memory than others: rows rewritten in place
     /// ([`EditPlan::update`](crate::plan::EditPlan::update)), and children that are rotated or whose scales
     /// are set or change separately for each axis ([`ScaleRule::Axes`](crate::plan::ScaleRule::Axes)).
     pub detailed_edits: bool,
@@ -130,7 +130,7 @@ fn above_zero(name: &str, value: f64) -> Result<(), String> {
 /// Changes to the initial rows.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct StartRule {
-    /// Opacity of all rows, in (0, 1); `None`: the trainer's.
+    /// Opacity of all rows, in (0, 1); `None`: the trainer's default.
     pub opacity: Option<f32>,
     /// Factor on all standard deviations, > 0.
     pub scale: f32,

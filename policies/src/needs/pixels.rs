@@ -9,8 +9,8 @@ use crate::signals::AuxColumn;
 ///
 /// (Σ w·M(p) / (Σ w)^`footprint`)^`view_power`, with M(p) = e(p)^`power` · (1 + `edge` · g(p) / ḡ),
 ///
-/// both sums over the pixels p that the row is blended into, with w its blend weight α·T there and e the
-/// pixel's error according to `map`. g is the 8-neighbour Laplacian of the photograph's 8-bit luma, clipped
+/// both sums over the pixels p that the row is blended into, with w the row's blend weight α·T in p and e the
+/// error of p according to `map`. g is the 8-neighbour Laplacian of the photograph's 8-bit luma, clipped
 /// to 0..255, and ḡ its mean over the view (in a view without edges all pixels weigh the same).
 ///
 /// The default is Σ w·e. A power above 1 emphasises the worst pixels, a footprint of 1 gives the mean error
@@ -19,13 +19,13 @@ use crate::signals::AuxColumn;
 pub struct ErrorScore {
     /// The error e of a pixel.
     pub map: ErrorMap,
-    /// Power of a pixel's error, in (0, 16].
+    /// Exponent of a pixel's error, in (0, 16].
     pub power: f32,
     /// Weight of edges, >= 0; 0 ignores them at no cost.
     pub edge: f32,
-    /// Power of the sum of blend weights in the denominator, in `[0, 1]`.
+    /// Exponent of the sum of blend weights in the denominator, in `[0, 1]`.
     pub footprint: f32,
-    /// Power of a view's score, in (0, 1].
+    /// Exponent of a view's score, in (0, 1].
     pub view_power: f32,
 }
 
@@ -95,9 +95,9 @@ impl ErrorScore {
 /// Selects pixels of the training views as candidates for new rows.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct CandidateRequest {
-    /// Start of the window (exclusive) `[step]`.
+    /// Start of the collection (exclusive) `[step]`.
     pub from: u32,
-    /// End of the window (exclusive) `[step]`.
+    /// End of the collection (exclusive) `[step]`.
     pub until: u32,
     /// Each step collects one candidate per this many rows, >= 1.
     pub rows_per_candidate: u32,

@@ -9,8 +9,8 @@ use super::above_zero;
 pub struct Cadence {
     /// Iterations per optimiser step, for all parameters; >= 1.
     pub all: u32,
-    /// Iterations per step of the spherical-harmonic coefficients of bands 1–3; the larger of the two
-    /// intervals applies to them; >= 1.
+    /// Iterations per optimiser step of the spherical-harmonic coefficients of bands 1–3, >= 1; the larger of
+    /// `all` and `sh_rest` applies to them.
     pub sh_rest: u32,
 }
 
@@ -30,14 +30,14 @@ impl Cadence {
 
     /// True if a backend made for `longest` has the gradient sums and step counts that this cadence needs.
     pub fn is_within(self, longest: Self) -> bool {
-        let is_sound = self.all > 0 && self.sh_rest > 0;
-        let all = self.all == 1 || longest.all > 1;
-        let apart = self.sh_rest <= self.all || longest.sh_rest > 1;
-        is_sound && all && apart
+        let is_valid = self.all > 0 && self.sh_rest > 0;
+        let all_fits = self.all == 1 || longest.all > 1;
+        let sh_rest_fits = self.sh_rest <= self.all || longest.sh_rest > 1;
+        is_valid && all_fits && sh_rest_fits
     }
 }
 
-/// Learning rates published with a policy; `None`: the trainer's.
+/// Learning rates published with a policy; `None`: the trainer's rate applies.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct RateOverrides {
     /// Means `[fraction of the extent per step]`.
@@ -59,9 +59,9 @@ pub struct RateOverrides {
 /// A learning rate, which falls (or rises) log-linearly over the run.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Rate {
-    /// At the start of the run, > 0.
+    /// The rate at the start of the run, > 0.
     pub start: f64,
-    /// At its end, > 0.
+    /// The rate at the end of the run, > 0.
     pub end: f64,
 }
 

@@ -19,10 +19,10 @@ impl LossTerms {
         !(self.opacity > 0.0 || self.scale > 0.0)
     }
 
-    /// Checks that both are finite and at least 0.
+    /// Checks that both coefficients are finite and at least 0.
     ///
     /// # Errors
-    /// The first that is not, with its value.
+    /// The first coefficient that is not, with its value.
     pub fn check(&self) -> Result<(), String> {
         at_least("loss_terms.opacity", self.opacity.into(), 0.0)?;
         at_least("loss_terms.scale", self.scale.into(), 0.0)
@@ -31,9 +31,9 @@ impl LossTerms {
 
 /// Noise on the means after each optimiser step (*3D Gaussian Splatting as Markov Chain Monte Carlo*,
 /// Kheradmand et al. 2024, section 3.2): Δμ = Σ·ξ · σ(−`sharpness`·(o − `opacity`)) · `strength` · λ,
-/// with Σ the row's covariance, ξ ~ N(0, I), o its opacity, σ the logistic function and λ the learning rate
-/// of the means at that step `[scene units]`, without the trainer's increase in short runs (which serves only to move
-/// parameters further along their gradients).
+/// with Σ the row's covariance, ξ ~ N(0, I), o its opacity, σ the logistic function and λ the learning rate of the
+/// means at that step `[scene units]`. λ excludes the factor by which the trainer increases rates in short runs, which
+/// serves only to move parameters further along their gradients.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct NoiseTerm {
     /// Strength of the noise `[1 / scene units²]`, >= 0.
@@ -53,7 +53,7 @@ impl NoiseTerm {
     /// Checks that all numbers are finite and at least 0.
     ///
     /// # Errors
-    /// The first that is not, with its value.
+    /// The first number that is not, with its value.
     pub fn check(&self) -> Result<(), String> {
         at_least("noise.strength", self.strength.into(), 0.0)?;
         at_least("noise.sharpness", self.sharpness.into(), 0.0)?;

@@ -50,8 +50,8 @@ fn the_score_of_a_view_depends_on_error_footprint_and_power() {
     // 8 / √4 = 4, whose root is 2.
     assert!((score.of_view(8.0, 4.0) - 2.0).abs() < 1e-6);
     assert!((ErrorScore::default().of_view(8.0, 4.0) - 8.0).abs() < 1e-6);
-    let none = [(0.0, 4.0), (8.0, 0.0), (f32::NAN, 4.0)];
-    assert!(none.iter().all(|&(error, weight)| score.of_view(error, weight).to_bits() == 0));
+    let unscored = [(0.0, 4.0), (8.0, 0.0), (f32::NAN, 4.0)];
+    assert!(unscored.iter().all(|&(error, weight)| score.of_view(error, weight).to_bits() == 0));
 }
 
 #[test]

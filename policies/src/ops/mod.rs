@@ -8,8 +8,8 @@ use crate::edit::{
 };
 use crate::signals::SignalSet;
 
-/// A compiled plan. Rows `0..rows_before` are live before it, rows `0..rows_after` after it. No slot at or
-/// beyond the budget is written, nor any before `first_row`.
+/// A compiled plan. Rows `0..rows_before` are live before the edit, rows `0..rows_after` after it. No slot at
+/// or beyond the budget is written, nor any before `first_row`.
 ///
 /// In pass 1 a backend executes `families` (it reads the parent once, then writes its children and the parent
 /// itself), `updates` and `seeds`: no slot is written twice, and no written slot is read by another entry. In
@@ -25,9 +25,9 @@ pub struct RowOps {
     pub rows_after: usize,
     /// The budget the plan was made for.
     pub budget: usize,
-    /// Parents; see [`offspring`](Self::offspring) for their children.
+    /// Parents with their children; see [`offspring`](Self::offspring).
     pub families: Vec<Family>,
-    /// Scales and rotations that are too large for a [`Family`].
+    /// Scale rules and rotations that do not fit into the compact [`Family`], which refers to them by index.
     pub shapes: Vec<(ScaleRule, [f32; 4])>,
     /// Slots of all children, family after family.
     pub child_slots: Vec<u32>,
@@ -144,20 +144,20 @@ impl RowOps {
     /// made for.
     #[must_use]
     pub fn after_frozen(mut self, frozen: usize) -> Self {
-        let by = frozen as u32;
+        let shift = frozen as u32;
         self.first_row += frozen;
         self.rows_before += frozen;
         self.rows_after += frozen;
         self.budget += frozen;
         for family in &mut self.families {
-            family.parent += by;
+            family.parent += shift;
         }
-        self.child_slots.iter_mut().for_each(|slot| *slot += by);
-        self.updates.iter_mut().for_each(|(row, _)| *row += by);
-        self.seeds.iter_mut().for_each(|(slot, _)| *slot += by);
+        self.child_slots.iter_mut().for_each(|slot| *slot += shift);
+        self.updates.iter_mut().for_each(|(row, _)| *row += shift);
+        self.seeds.iter_mut().for_each(|(slot, _)| *slot += shift);
         for (from, to) in &mut self.moves {
-            *from += by;
-            *to += by;
+            *from += shift;
+            *to += shift;
         }
         self
     }
@@ -185,7 +185,7 @@ impl RowOps {
             return Vec::new();
         }
         let mut order: Vec<u32> = (0..self.rows_after as u32).collect();
-        // Siblings, and seeds, have ascending slots.
+        // Slots ascend among siblings and among seeds.
         order.sort_unstable_by_key(|&slot| (origin[slot as usize], slot));
         order
     }
@@ -239,12 +239,12 @@ impl RowOps {
         let mut claimed = Slots::new(slots);
         self.check_families(&mut claimed)?;
         for (row, update) in &self.updates {
-            valid(update.bad_field(), || format!("update of row {row}"))?;
+            validate(update.bad_field(), || format!("update of row {row}"))?;
             self.check_live("updated row", *row)?;
             claimed.claim("updated row", *row)?;
         }
         for (slot, seed) in &self.seeds {
-            valid(seed.bad_field(), || format!("seed in slot {slot}"))?;
+            validate(seed.bad_field(), || format!("seed in slot {slot}"))?;
             self.check_new_slot("seed", *slot)?;
             claimed.claim("seed", *slot)?;
         }
@@ -270,7 +270,7 @@ impl RowOps {
         let is_rewritten = |family: &&Family| family.fate == ParentFate::BecomesChild;
         let updated = self.updates.len() + self.families.iter().filter(is_rewritten).count();
         require(counts.updated == updated, || format!("{updated} updated, but {counts:?}"))?;
-        valid(self.decay.and_then(|decay| decay.bad_field()), || "the decay".to_owned())?;
+        validate(self.decay.and_then(|decay| decay.bad_field()), || "the decay".to_owned())?;
         require(self.clamp_opacity.is_none_or(in_open_unit), || {
             format!("opacity bound {:?}", self.clamp_opacity)
         })
@@ -281,7 +281,7 @@ impl RowOps {
         for family in &self.families {
             let parent = family.parent;
             let bad_field = self.find_offspring(family).map_or(Some("shape"), |o| o.bad_field());
-            valid(bad_field, || format!("family of row {parent}"))?;
+            validate(bad_field, || format!("family of row {parent}"))?;
             require(family.first_child as usize == first_child, || {
                 format!("family of row {parent} starts at {}", family.first_child)
             })?;
@@ -322,10 +322,10 @@ impl RowOps {
         }
         let seeds = self.seeds.iter().map(|seed| &seed.0);
         let new_slots = self.child_slots.iter().chain(seeds);
-        let on_top = new_slots.filter(|&&slot| slot as usize >= *rows_before).count();
-        require(on_top == rows_after.saturating_sub(*rows_before), || {
+        let appended = new_slots.filter(|&&slot| slot as usize >= *rows_before).count();
+        require(appended == rows_after.saturating_sub(*rows_before), || {
             format!(
-                "{on_top} rows added beyond row {rows_before}, which does not give {rows_after} rows after"
+                "{appended} rows added beyond row {rows_before}, which does not give {rows_after} rows after"
             )
         })
     }
@@ -347,9 +347,9 @@ impl RowOps {
     }
 }
 
-fn valid(bad_field: Option<&'static str>, what: impl Fn() -> String) -> Result<(), BrokenOps> {
+fn validate(bad_field: Option<&'static str>, item: impl Fn() -> String) -> Result<(), BrokenOps> {
     require(bad_field.is_none(), || {
-        format!("{} has a bad {}", what(), bad_field.unwrap_or_default())
+        format!("{} has a bad {}", item(), bad_field.unwrap_or_default())
     })
 }
 

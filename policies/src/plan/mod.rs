@@ -1,9 +1,9 @@
 //! The edits of a policy as data: the only way to change the number of rows.
 //!
 //! A policy writes into an [`EditPlan`]; the plan compiles to [`RowOps`]; a backend applies them.
-//! Every call preserves the invariants, so a plan that exceeds the budget cannot be expressed: each row has
-//! at most one edit, and the number of rows never exceeds the budget, not even during the edit. A refused
-//! call changes nothing, returns the reason, and is counted.
+//! Every call preserves two invariants, so no plan can break them: each row has at most one edit, and the number
+//! of rows never exceeds the budget, not even during the edit. A refused call changes nothing, returns the
+//! reason, and is counted.
 
 use crate::edit::in_open_unit;
 pub use crate::edit::{
@@ -14,7 +14,7 @@ use crate::needs::Needs;
 pub use crate::ops::{BrokenOps, EditCounts, Family, RowOps};
 use crate::signals::{Signal, SignalSet};
 
-/// The reason why a plan refused an edit. Each refusal is counted.
+/// The reason why a plan refused an edit.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum Refused {
     /// The edit would need more rows than the budget leaves.
@@ -173,12 +173,12 @@ impl EditPlan {
         }
         self.claim(parent, offspring.bad_field(), children, RowEdit::Grown)?;
         // Reserve the maximum at once: reallocating would briefly need twice the memory.
-        let most = (self.rows() - self.pruned).min(self.room());
+        let max_families = (self.rows() - self.pruned).min(self.room());
         if self.families.is_empty() {
-            self.families.reserve_exact(most);
+            self.families.reserve_exact(max_families);
         }
         if is_detailed && self.shapes.is_empty() {
-            self.shapes.reserve_exact(most);
+            self.shapes.reserve_exact(max_families);
         }
         let first_child = self.children() as u32;
         self.families.push(Family::new(parent, first_child, offspring, &mut self.shapes));
@@ -186,7 +186,7 @@ impl EditPlan {
         Ok(())
     }
 
-    /// Rewrites `row` in place, where [`Needs::detailed_edits`] allows it.
+    /// Rewrites `row` in place, if [`Needs::detailed_edits`] allows it.
     ///
     /// # Errors
     /// [`Refused::Undeclared`], [`Refused::NoSuchRow`], [`Refused::Taken`], [`Refused::BadValue`].
@@ -225,7 +225,7 @@ impl EditPlan {
     }
 
     /// Limits the opacity of all rows, after all other edits. If called several times, the lowest limit
-    /// applies. Both opacity moments become zero.
+    /// applies. Both optimiser moments of all opacities become zero.
     ///
     /// # Errors
     /// [`Refused::BadValue`] when `max` is not in (0, 1).
@@ -247,7 +247,7 @@ impl EditPlan {
         }
     }
 
-    /// Adds a reason for the event log. Different tags are joined by `+`.
+    /// Adds `tag` to the reasons in the event log, which are joined by `+`. Repeated tags are ignored.
     pub fn cause(&mut self, tag: &str) {
         if tag.is_empty() || self.cause.split('+').any(|known| known == tag) {
             return;

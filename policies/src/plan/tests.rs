@@ -44,8 +44,8 @@ fn a_row_has_one_edit() {
 #[test]
 fn a_refused_value_changes_nothing() {
     let mut plan = EditPlan::new(2, 8).allowing(&detailed());
-    let lone = Offspring { children: 0, ..family(1, ParentFate::Stays) };
-    assert_eq!(plan.grow(0, lone), Err(Refused::BadValue("children")));
+    let childless = Offspring { children: 0, ..family(1, ParentFate::Stays) };
+    assert_eq!(plan.grow(0, childless), Err(Refused::BadValue("children")));
     let nowhere = Update { position: Some([0.0, f32::NAN, 0.0]), ..Update::NONE };
     assert_eq!(plan.update(0, nowhere), Err(Refused::BadValue("position")));
     assert_eq!(plan.append(Seed { opacity: 1.0, ..SEED }), Err(Refused::BadValue("opacity")));
@@ -181,7 +181,7 @@ proptest! {
         let mut seeds = 0;
         for call in calls {
             let room = plan.room();
-            let done = match call {
+            let result = match call {
                 Call::Prune(row) => plan.prune(row).map(|()| {
                     pruned.push(row);
                     expected.retain(|&occupant| occupant != Occupant::Row(row));
@@ -198,7 +198,7 @@ proptest! {
                     seeds += 1;
                 }),
             };
-            if done.is_err() {
+            if result.is_err() {
                 denied += 1;
                 prop_assert_eq!(plan.room(), room);
             }
@@ -209,17 +209,17 @@ proptest! {
         prop_assert_eq!(ops.check(), Ok(()));
         prop_assert_eq!(ops.counts.denied, denied);
         prop_assert!(ops.rows_after <= budget.max(rows));
-        let mut found = execute(&ops, &pruned, budget);
+        let mut occupants = execute(&ops, &pruned, budget);
         let order = ops.order();
         if !order.is_empty() {
-            found = order.iter().map(|&slot| found[slot as usize]).collect();
+            occupants = order.iter().map(|&slot| occupants[slot as usize]).collect();
         }
         expected.sort_by_key(|occupant| match *occupant {
             Occupant::Row(row) => (0, row, 0),
             Occupant::Child { parent, number } => (0, parent, number),
             Occupant::Seed(seed) => (1, seed as u32, 0),
         });
-        prop_assert_eq!(found, expected);
+        prop_assert_eq!(occupants, expected);
     }
 }
 
@@ -233,8 +233,8 @@ fn signals_are_reset_alone_or_all_together() {
         plan.compile().reset_signals
     };
     let only = |signals: &[Signal]| Reset::Only(signals.iter().copied().collect());
-    let some = reset(&[only(&[Signal::WeightSum]), only(&[Signal::VisibleCount])]);
-    assert_eq!(some, SignalSet::from([Signal::VisibleCount, Signal::WeightSum]));
+    let two = reset(&[only(&[Signal::WeightSum]), only(&[Signal::VisibleCount])]);
+    assert_eq!(two, SignalSet::from([Signal::VisibleCount, Signal::WeightSum]));
     // Signals of the current state and signals kept per epoch are not reset.
     assert!(reset(&[only(&[Signal::Opacity, Signal::WeightMax])]).is_empty());
     let all = reset(&[only(&[Signal::WeightSum]), Reset::Signals]);

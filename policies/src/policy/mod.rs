@@ -1,8 +1,8 @@
 //! The policy interface: a policy's declarations, inputs and outputs.
 //!
 //! A policy decides which Gaussians are cloned, split, pruned or added. It declares the statistics
-//! it needs ([`Needs`]), and the backend accumulates only these. At the steps at which it
-//! [`is_due`](DensityPolicy::is_due) it reads a [`Snapshot`] and writes its edits into an
+//! it needs ([`Needs`]), and the backend accumulates only these. At its events, the steps at which it
+//! [`is_due`](DensityPolicy::is_due), it reads a [`Snapshot`] and writes its edits into an
 //! [`EditPlan`]. It accesses neither the model's parameters nor devices, so every policy runs unchanged on every
 //! backend and can be tested without a renderer.
 
@@ -28,8 +28,8 @@ pub trait DensityPolicy: Send {
     /// True if this policy edits after the optimiser step of iteration `step` (1-based).
     fn is_due(&self, step: u32) -> bool;
 
-    /// The interval of optimiser steps at iteration `step`, at most the [declared](Needs::cadence) one. If it
-    /// changes, the gradients summed so far are used at the next optimiser step.
+    /// The interval of optimiser steps at iteration `step`, at most the [declared](Needs::cadence) interval. If
+    /// it changes, the gradients summed so far are used at the next optimiser step.
     fn cadence(&self, step: u32) -> Cadence {
         let _ = step;
         Cadence::default()
@@ -41,7 +41,7 @@ pub trait DensityPolicy: Send {
         declared
     }
 
-    /// The noise after iteration `step`; `declared` is that of [`Needs::noise`].
+    /// The noise added to the means after iteration `step`; `declared` is that of [`Needs::noise`].
     fn noise(&self, step: u32, declared: Option<NoiseTerm>) -> Option<NoiseTerm> {
         let _ = step;
         declared
@@ -117,7 +117,7 @@ pub struct SceneInfo {
     pub initial_rows: usize,
     /// Length of the run in steps.
     pub iterations: u32,
-    /// True if images are composited on white (the original then resets opacity at step 500).
+    /// True if images are composited on white (the original 3DGS then resets opacities at step 500).
     pub white_background: bool,
 }
 
@@ -189,13 +189,13 @@ pub struct Candidate {
     pub position: [f32; 3],
     /// Ground-truth colour, sRGB-encoded in `[0, 1]`.
     pub colour: [f32; 3],
-    /// Width of one pixel at that depth, z / f `[scene units]`, > 0.
+    /// Width of one pixel at the depth z of the surface point, z / f `[scene units]`, > 0.
     pub pixel_size: f32,
-    /// Error of the pixel in the requested mode, > 0.
+    /// Error of the pixel in the requested [`ErrorMode`], > 0.
     pub error: f32,
 }
 
-/// One auxiliary view, as the policy sees it.
+/// The loss, the per-row statistics and the surface points of one auxiliary view.
 #[derive(Debug, Clone, Copy)]
 pub struct AuxView<'a> {
     /// Iteration just finished, 1-based.

@@ -10,7 +10,7 @@
 //! ## Method
 //!
 //! **Growth** is that of `vanilla`, with its parameters: clones and splits by screen gradient, pruning by
-//! opacity and size, opacity resets, and a hard stop at the budget (or `governor`). It ends at
+//! opacity and size, opacity resets, and a hard stop at the budget (with `governor`, a growth curve). It ends at
 //! `grow_until`, before the first prune.
 //!
 //! **Pruning.** At the steps `first_at` and `second_at` all training views are rendered. A Gaussian's
@@ -26,14 +26,14 @@
 //! ## Under a budget
 //!
 //! The budget bounds growth and is never exceeded. Nothing grows after the prunes, so a run ends below
-//! the budget, by an amount that depends on the scene; when comparing policies, also compare at equal final numbers.
+//! the budget, by an amount that depends on the scene; also compare at equal final numbers of Gaussians.
 //! With a budget of 8,000 and 2,000 steps on half-resolution images, the defaults kept 97 % of the grown model on
 //! room256 and 87 % on cup; the light variant kept 34 % and 11 %.
 //!
 //! ## Differences from the paper
 //!
-//! - The paper starts from a radiance field and trains on its renderings. Here initial model and
-//!   photographs are the same as for every other policy.
+//! - The paper starts from a radiance field and trains on its renderings. Here the initial model and
+//!   the photographs are the same as for every other policy.
 //! - The last Gaussian is never pruned.
 //! - Training views that nearly duplicate another are not rendered (`--full` renders all).
 //! - The paper then groups cameras and stores which Gaussians each group sees. That speeds up viewing and
@@ -49,7 +49,7 @@
 //! | grow_until | 15000 | >= 0 | step | end of growth, of pruning by opacity and of opacity resets (exclusive) |
 //! | grow_every | 100 | >= 0 | steps | interval of growth; 0: never |
 //! | tau | 0.0002 | >= 0 | 1 / NDC | screen gradient from which a Gaussian is densified |
-//! | small | 0.01 | >= 0 | scene extent | largest size that is cloned; larger ones are split |
+//! | small | 0.01 | >= 0 | scene extent | Gaussians up to this size are cloned, larger ones split |
 //! | split_factor | 1.6 | 1 to 100 | | a split divides the scales by this |
 //! | min_opacity | 0.005 | 0 to 1 | | Gaussians below this opacity are pruned during growth |
 //! | max_scale | 0.1 | > 0 | scene extent | Gaussians above this size are pruned during growth |
@@ -61,7 +61,7 @@
 //! | first_at | 16000 | >= 0 | step | first prune; 0: none |
 //! | second_at | 24000 | >= 0 | step | second prune; 0: none |
 //! | min_weight | 0.01 | 0 to 1 | | Gaussians whose largest blend weight is below this are pruned |
-//! | victims | "lowest" | lowest, random | | which Gaussians are pruned |
+//! | victims | "lowest" | lowest, random | | which Gaussians are pruned: the least important or random ones |
 //! | random_keep | 0 | >= 0 | Gaussians | Gaussians that `random` keeps at the second prune; 0: prunes as many as `min_weight` would |
 //!
 //! Defaults in steps are for a run of 30,000 iterations and scale with its length; intervals
@@ -183,8 +183,8 @@ impl RadSplat {
     /// Number of rows that the control keeps at `step`, if `random_keep` sets it.
     fn kept_at_random(&self, step: u32) -> Option<usize> {
         let RadSplatParams { second_at, victims, random_keep, .. } = self.params;
-        let is_given = victims == Victims::Random && random_keep > 0 && step == second_at;
-        is_given.then_some(random_keep as usize)
+        let applies = victims == Victims::Random && random_keep > 0 && step == second_at;
+        applies.then_some(random_keep as usize)
     }
 }
 

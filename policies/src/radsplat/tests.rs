@@ -32,7 +32,7 @@ fn rows_below_min_weight_in_every_view_are_pruned() {
         assert_eq!((done.pruned.as_slice(), done.ops.cause.as_str()), (&[0, 3][..], "prune"));
         assert!(done.ops.clamp_opacity.is_none() && done.cloned.is_empty());
     }
-    // The light variant leaves row 2.
+    // The light variant keeps only row 2.
     assert_eq!(run(&event(16_000, &views), "min_weight = 0.25").pruned, [0, 1, 3, 4]);
     assert!(run(&event(16_000, &views), "min_weight = 0.0").pruned.is_empty());
     // One row is always kept: that with the largest weight.
@@ -93,7 +93,7 @@ fn the_second_prune_of_the_control_may_keep_a_given_number() {
     let set = "victims = \"random\"\nrandom_keep = 3";
     let event = event(24_000, &[&[0.0, 0.5, 0.5, 0.5, 0.5]]);
     assert_eq!(run(&event, set).ops.rows_after, 3);
-    // `random_keep` does not apply to the first prune or the real policy; a smaller model is left as it is.
+    // `random_keep` applies neither to the first prune nor without the control; a smaller model is not pruned.
     assert_eq!(run(&Event { step: 16_000, ..event.clone() }, set).ops.rows_after, 4);
     assert_eq!(run(&event, "random_keep = 3").ops.rows_after, 4);
     assert_eq!(run(&event, "victims = \"random\"\nrandom_keep = 1").ops.rows_after, 1);

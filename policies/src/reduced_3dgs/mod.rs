@@ -9,7 +9,7 @@
 //! ## Method
 //!
 //! **Growth** is that of `vanilla`, with its parameters: clones and splits by screen gradient, pruning by
-//! opacity and size, opacity resets, and a hard stop at the budget (or `governor`).
+//! opacity and size, opacity resets, and a hard stop at the budget (with `governor`, a growth curve).
 //!
 //! **Redundancy.** No view can separate Gaussians within one pixel. Each Gaussian therefore has a sphere
 //! around its mean with radius r = √3/2 · p, half the diagonal of a cube with edge p, where p is the smallest
@@ -23,7 +23,7 @@
 //! 1. A Gaussian is redundant if R > max(mean + `deviations` · standard deviation, `min_redundancy`), with
 //!    mean and standard deviation over all Gaussians. Redundant Gaussians below their median opacity are
 //!    pruned.
-//! 2. Gaussians below both `faint_opacity` and the `faint_share` quantile of all opacities are pruned.
+//! 2. Faint Gaussians, those below both `faint_opacity` and the `faint_share` quantile of all opacities, are pruned.
 //! 3. After growth (`grow_until`), Gaussians below opacity 1/255 are pruned, as they are never rendered.
 //!
 //! **Loss.** `opacity_term` · mean opacity is added, so that unneeded Gaussians fade.
@@ -38,13 +38,13 @@
 //! The budget bounds growth and is never exceeded. Until `grow_until`, new Gaussians take the place of pruned
 //! ones. Nothing grows after that, so a run ends below the budget: with the defaults each prune removes at
 //! least the faintest 3 %, as long as these are below `faint_opacity`. With a budget of 8,000, runs of 7,000
-//! steps on half-resolution images ended at 24 to 34 % of the budget (six scenes). When comparing policies, also
-//! compare at equal final numbers.
+//! steps on half-resolution images ended at 24 to 34 % of the budget (six scenes). Also compare policies
+//! at equal final numbers of Gaussians.
 //!
 //! ## Differences from the published code
 //!
 //! - Spherical harmonics of Gaussians whose colour hardly varies are not dropped, as this needs the colour
-//!   seen by each view. Without it, the published schedule prunes to the end of the run, as here. The
+//!   seen by each view. Without this step, the published schedule prunes to the end of the run, as here. The
 //!   published codebook for the finished model is not part of density control.
 //! - The paper does not define the extent of an ellipsoid. Three standard deviations is where a rasteriser
 //!   stops drawing it.
@@ -63,7 +63,7 @@
 //! | grow_until | 15000 | >= 0 | step | end of growth and of opacity resets (exclusive) |
 //! | grow_every | 100 | >= 0 | steps | interval of growth; 0: never |
 //! | tau | 0.0002 | >= 0 | 1 / NDC | screen gradient from which a Gaussian is densified |
-//! | small | 0.01 | >= 0 | scene extent | largest size that is cloned; larger ones are split |
+//! | small | 0.01 | >= 0 | scene extent | Gaussians up to this size are cloned, larger ones split |
 //! | split_factor | 1.6 | 1 to 100 | | a split divides the scales by this |
 //! | min_opacity | 0.005 | 0 to 1 | | Gaussians below this opacity are pruned during growth |
 //! | max_scale | 0.1 | > 0 | scene extent | Gaussians above this size are pruned during growth |
@@ -78,10 +78,10 @@
 //! | sigmas | 3.0 | > 0 | standard deviations | half-axes of an ellipsoid |
 //! | deviations | 1.0 | >= 0 | standard deviations | a Gaussian is redundant only if R is this far above the mean |
 //! | min_redundancy | 3.0 | >= 0 | Gaussians | a Gaussian is redundant only if R is above this |
-//! | faint_share | 0.03 | 0 to 1 | Gaussians | Gaussians below this quantile of opacity … |
-//! | faint_opacity | 0.05 | 0 to 1 | | … and below this opacity are pruned; 0: none |
+//! | faint_share | 0.03 | 0 to 1 | Gaussians | a Gaussian is faint only if it is below this quantile of opacity |
+//! | faint_opacity | 0.05 | 0 to 1 | | a Gaussian is faint only if it is below this opacity; 0: none is |
 //! | opacity_term | 0.001 | >= 0 | loss | coefficient of the mean opacity |
-//! | victims | "lowest" | lowest, random | | which Gaussians are pruned |
+//! | victims | "lowest" | lowest, random | | which Gaussians are pruned: redundant and faint ones, or as many random ones |
 //! | random_keep | 0 | >= 0 | Gaussians | final number of `random`; 0: each prune removes as many as `lowest` |
 //!
 //! Defaults in steps are for a run of 30,000 iterations and scale with its length; intervals
@@ -202,7 +202,7 @@ impl Reduced {
         Ok(victims)
     }
 
-    /// R of every row, >= 1. Shape: `[rows]`.
+    /// The redundancy R of every row, >= 1. Shape: `[rows]`.
     fn redundancy(&self, now: &Snapshot<'_>) -> PolicyResult<Vec<f32>> {
         let ellipsoids = Ellipsoids {
             means: now.positions()?,
@@ -217,9 +217,9 @@ impl Reduced {
     /// The redundant rows below their median opacity.
     fn redundant(&self, redundancy: &[f32], opacity: &[f32]) -> Vec<u32> {
         let (mean, deviation) = mean_and_deviation(redundancy);
-        let least = (mean + self.params.deviations * deviation).max(self.params.min_redundancy);
+        let limit = (mean + self.params.deviations * deviation).max(self.params.min_redundancy);
         let rows = (0..redundancy.len() as u32)
-            .filter(|&row| f64::from(redundancy[row as usize]) > least)
+            .filter(|&row| f64::from(redundancy[row as usize]) > limit)
             .filter(|&row| opacity[row as usize].is_finite());
         let mut rows: Vec<u32> = rows.collect();
         let opacities: Vec<f32> = rows.iter().map(|&row| opacity[row as usize]).collect();
@@ -245,7 +245,7 @@ impl Reduced {
     }
 }
 
-/// Mean and sample standard deviation; 0 if there are too few values.
+/// Mean and sample standard deviation; each is 0 if there are too few values for it.
 fn mean_and_deviation(values: &[f32]) -> (f64, f64) {
     let count = values.len() as f64;
     let mean = values.iter().map(|&v| f64::from(v)).sum::<f64>() / count.max(1.0);

@@ -10,21 +10,21 @@ const HALF_DIAGONAL: f64 = 0.866_025_403_784_438_6;
 const MAX_STEPS: u32 = 50;
 /// Relative change at which Newton's method stops: some multiples of the rounding error of an f64.
 const TOLERANCE: f64 = 1e-14;
-/// Shortest half-axis: its square is well within the range of f64, and no scene is so small.
+/// Shortest half-axis `[scene units]`: its square is well within the range of f64, and no scene is so small.
 const SHORTEST: f64 = 1e-38;
-/// Longest half-axis and largest distance, for the same reason.
+/// Longest half-axis and largest distance `[scene units]`, for the same reason.
 const LONGEST: f64 = 1e38;
 
 /// Ellipsoids and pixel sizes of all rows.
 pub(super) struct Ellipsoids<'a> {
-    /// `[scene units]`.
+    /// Means `[scene units]`.
     pub(super) means: &'a [[f32; 3]],
-    /// `[ln scene units]`.
+    /// Natural logarithms of the standard deviations `[ln scene units]`.
     pub(super) log_scales: &'a [[f32; 3]],
     /// Quaternions (w, x, y, z) of any length but 0.
     pub(super) orientations: &'a [[f32; 4]],
-    /// Smallest width of a pixel at the row `[scene units]`; not finite or not positive where no view
-    /// showed it.
+    /// Smallest width of a pixel at the depth of the row `[scene units]`; not finite or not positive if no view
+    /// showed the row.
     pub(super) pixel_sizes: &'a [f32],
     /// Half-axes of ellipsoids `[standard deviations]`, > 0.
     pub(super) sigmas: f64,
@@ -50,7 +50,7 @@ impl Ellipsoids<'_> {
             rows.iter().map(|&row| self.means[row as usize].map(f64::from)).collect();
         let tree = Neighbours::new(&points);
         let mut redundancy = vec![f32::INFINITY; self.means.len()];
-        let mut met = Vec::new();
+        let mut intersected = Vec::new();
         tree.for_each_nearest(neighbours, |index, nearest| {
             let (row, mean) = (rows[index], points[index]);
             let radius = HALF_DIAGONAL * f64::from(self.pixel_sizes[row as usize]);
@@ -58,8 +58,8 @@ impl Ellipsoids<'_> {
             if !has_sphere {
                 return;
             }
-            met.clear();
-            met.push(row);
+            intersected.clear();
+            intersected.push(row);
             for other in nearest {
                 let (row, at) = (rows[other.index as usize], points[other.index as usize]);
                 let axes = half_axes[row as usize];
@@ -73,12 +73,12 @@ impl Ellipsoids<'_> {
                 };
                 // Fast tests with the inscribed and the circumscribed ball of the ellipsoid.
                 if !is_farther(short + radius) || (!is_farther(long + radius) && meets()) {
-                    met.push(row);
+                    intersected.push(row);
                 }
             }
-            for &other in &met {
+            for &other in &intersected {
                 let known = &mut redundancy[other as usize];
-                *known = known.min(met.len() as f32);
+                *known = known.min(intersected.len() as f32);
             }
         });
         redundancy.into_iter().map(|count| if count.is_finite() { count } else { 1.0 }).collect()
@@ -112,7 +112,7 @@ fn rotate_back(q: [f32; 4], v: [f64; 3]) -> [f64; 3] {
 /// With half-axes e and the centre p outside, the ellipsoid's nearest point is eᵢ² pᵢ / (eᵢ² + t) with the
 /// t >= 0 at which F(t) = Σ (eᵢ pᵢ / (eᵢ² + t))² − 1 is 0; its squared distance D(t) = t² Σ (pᵢ / (eᵢ² + t))²
 /// grows with t. F is decreasing and convex, so Newton's method from below never passes the root. If D exceeds
-/// the squared radius at any iterate, the sphere does not intersect.
+/// the squared radius at any iterate, the sphere does not intersect the ellipsoid.
 fn sphere_meets(centre: [f64; 3], radius: f64, half_axes: [f64; 3]) -> bool {
     let axes = [0, 1, 2].map(|k: usize| (half_axes[k], centre[k].abs()));
     if axes.iter().any(|(e, p)| *p > e + radius) {
@@ -242,8 +242,8 @@ mod tests {
         // A radius of √3/2 is too small.
         assert_eq!(redundancy(&xs, &[[1.0; 3]; 4], &[1.0; 4], 30), [1.0; 4]);
         // Only the second row has a sphere, which counts three rows.
-        let own = [0.0, pixel, f32::INFINITY, 0.0];
-        assert_eq!(redundancy(&xs, &[[1.0; 3]; 4], &own, 30), [3.0, 3.0, 3.0, 1.0]);
+        let second = [0.0, pixel, f32::INFINITY, 0.0];
+        assert_eq!(redundancy(&xs, &[[1.0; 3]; 4], &second, 30), [3.0, 3.0, 3.0, 1.0]);
         // One needle along the line and one across. Counts: 2, 3, 3, 2.
         let along = [[30.0, 0.01, 0.01], [1.0; 3], [1.0; 3], [0.01, 0.01, 30.0]];
         assert_eq!(redundancy(&xs, &along, &[pixel; 4], 30), [2.0, 2.0, 3.0, 2.0]);
@@ -252,8 +252,8 @@ mod tests {
     #[test]
     fn only_the_nearest_neighbours_are_tested() {
         // Five rows at one place: with two neighbours each sphere counts three, with thirty it counts five.
-        let at = |count| redundancy(&[1.0; 5], &[[1.0; 3]; 5], &[1.0; 5], count);
-        assert_eq!((at(2), at(30)), (vec![3.0; 5], vec![5.0; 5]));
+        let with = |count| redundancy(&[1.0; 5], &[[1.0; 3]; 5], &[1.0; 5], count);
+        assert_eq!((with(2), with(30)), (vec![3.0; 5], vec![5.0; 5]));
         assert!(redundancy(&[], &[], &[], 30).is_empty());
     }
 

@@ -33,7 +33,7 @@ fn opacities(crowd: [f32; 6]) -> Vec<f32> {
 }
 
 #[test]
-fn the_fainter_half_of_the_redundant_is_pruned() {
+fn the_fainter_half_of_the_redundant_rows_is_pruned() {
     // R is 1 for twenty rows and 6 for six: mean 56/26 = 2.154, standard deviation √(25·20·6/26/25) = 2.148.
     // The six are above 4.302. Their median opacity is (0.3 + 0.4)/2 = 0.35.
     let event = crowd(1000).with(Signal::Opacity, &opacities([0.1, 0.2, 0.3, 0.4, 0.6, 0.9]));
@@ -45,20 +45,20 @@ fn the_fainter_half_of_the_redundant_is_pruned() {
     // R must exceed `min_redundancy`.
     assert_eq!(pruned("min_redundancy = 5.9"), [20, 21, 22]);
     assert!(pruned("min_redundancy = 6.0").is_empty());
-    // With two neighbours R is 3, which is not more than 3.
+    // With two neighbours R is 3, which does not exceed the default `min_redundancy` of 3.
     assert!(pruned("neighbours = 2").is_empty());
     assert_eq!(pruned("neighbours = 3"), [20, 21, 22]);
     let done = run(&event, "");
     assert_eq!(done.ops.cause, "densify+prune");
     assert!(done.ops.reset_signals.contains(Signal::PixelSizeMin));
     // With the default `min_redundancy`, an R of 3 is not enough and 4 is.
-    let at = |xs: &[f32]| {
-        let fades: Vec<f32> = (0..xs.len()).map(|row| 0.1 + 0.1 * row as f32).collect();
-        let event = self::event(1000, xs).with(Signal::Opacity, &fades);
+    let pruned_at = |xs: &[f32]| {
+        let opacity: Vec<f32> = (0..xs.len()).map(|row| 0.1 + 0.1 * row as f32).collect();
+        let event = self::event(1000, xs).with(Signal::Opacity, &opacity);
         run(&event, "faint_opacity = 0.0\ndeviations = 0.0").pruned
     };
-    assert!(at(&[0.0, 0.0, 0.0, 9.0]).is_empty());
-    assert_eq!(at(&[0.0, 0.0, 0.0, 0.0, 9.0]), [0, 1]);
+    assert!(pruned_at(&[0.0, 0.0, 0.0, 9.0]).is_empty());
+    assert_eq!(pruned_at(&[0.0, 0.0, 0.0, 0.0, 9.0]), [0, 1]);
 }
 
 #[test]
@@ -79,34 +79,34 @@ fn the_smallest_pixel_determines_the_size_of_a_sphere() {
 }
 
 #[test]
-fn the_faintest_are_pruned() {
+fn the_faintest_rows_are_pruned() {
     // 101 rows: the 3 % quantile is the fourth lowest opacity, and below it are three.
     let xs: Vec<f32> = (0..101).map(|row| 10.0 * row as f32).collect();
-    let all = |first: f32, step: f32| -> Vec<f32> {
+    let opacities = |first: f32, step: f32| -> Vec<f32> {
         (0..101).rev().map(|rank| first + step * rank as f32).collect()
     };
     let event = event(1000, &xs);
     let pruned = |opacity: &[f32], set: &str| {
         run(&event.clone().with(Signal::Opacity, opacity), &format!("grow_every = 0\n{set}")).pruned
     };
-    let faint = all(0.01, 0.001);
+    let faint = opacities(0.01, 0.001);
     assert_eq!(pruned(&faint, ""), [98, 99, 100]);
     assert_eq!(pruned(&faint, "faint_share = 0.05"), [96, 97, 98, 99, 100]);
     assert!(pruned(&faint, "faint_opacity = 0.0").is_empty());
     // If the quantile is above 0.05, the limit is 0.05: 0.048 and 0.049 are below it.
-    assert_eq!(pruned(&all(0.048, 0.001), ""), [99, 100]);
-    assert_eq!(pruned(&all(0.048, 0.001), "faint_opacity = 0.0485"), [100]);
-    assert!(pruned(&all(0.5, 0.001), "").is_empty());
+    assert_eq!(pruned(&opacities(0.048, 0.001), ""), [99, 100]);
+    assert_eq!(pruned(&opacities(0.048, 0.001), "faint_opacity = 0.0485"), [100]);
+    assert!(pruned(&opacities(0.5, 0.001), "").is_empty());
 }
 
 #[test]
 fn invisible_rows_are_pruned_after_growth() {
     // 1/255 = 0.003922.
     let event = event(15_000, &[0.0, 10.0, 20.0]).with(Signal::Opacity, &[0.0039, 0.00393, 0.5]);
-    let at = |step| run(&Event { step, ..event.clone() }, "faint_opacity = 0.0").pruned;
-    assert_eq!((at(15_000), at(30_000)), (vec![0], vec![0]));
+    let pruned_at = |step| run(&Event { step, ..event.clone() }, "faint_opacity = 0.0").pruned;
+    assert_eq!((pruned_at(15_000), pruned_at(30_000)), (vec![0], vec![0]));
     // During growth vanilla prunes below 0.005.
-    assert_eq!(at(14_000), [0, 1]);
+    assert_eq!(pruned_at(14_000), [0, 1]);
     let early = Event { step: 14_000, ..event };
     assert!(run(&early, "faint_opacity = 0.0\ngrow_every = 0").pruned.is_empty());
 }
@@ -130,7 +130,7 @@ fn prunes_are_every_thousand_steps_except_at_resets() {
     let until = prunes(policy("prune_until = 27000", REFERENCE_ITERATIONS));
     assert_eq!(until, thousands(&|k| k <= 27 && ![3, 6, 9, 12].contains(&k)));
     assert!(prunes(policy("prune_every = 0", REFERENCE_ITERATIONS)).is_empty());
-    // 7,000/30,000 of 1,000 is 233.
+    // 1,000 · 7,000/30,000 = 233.3.
     let short = find("reduced-3dgs").unwrap();
     let scene = SceneInfo { iterations: 7000, ..Event::new(1, 1, 1).scene };
     let table = short.effective(&Default::default(), &scene).unwrap();
@@ -184,21 +184,21 @@ fn the_control_prunes_the_same_number_at_random() {
 fn the_control_may_end_at_a_given_number() {
     // From 810 to 10 over the four prunes at 27,000 to 30,000: each leaves a third.
     let xs: Vec<f32> = (0..810).map(|row| 10.0 * row as f32).collect();
-    let left = |step, rows: usize, set: &str| {
+    let kept = |step, rows: usize, set: &str| {
         let set = format!("victims = \"random\"\nrandom_keep = 10\n{set}");
         run(&event(step, &xs[..rows]), &set).ops.rows_after
     };
-    assert_eq!([left(27_000, 810, ""), left(28_000, 270, ""), left(29_000, 90, "")], [270, 90, 30]);
-    assert_eq!([left(30_000, 30, ""), left(30_000, 810, ""), left(30_000, 5, "")], [10, 10, 5]);
-    assert_eq!(left(27_000, 810, "prune_until = 27500"), 10);
+    assert_eq!([kept(27_000, 810, ""), kept(28_000, 270, ""), kept(29_000, 90, "")], [270, 90, 30]);
+    assert_eq!([kept(30_000, 30, ""), kept(30_000, 810, ""), kept(30_000, 5, "")], [10, 10, 5]);
+    assert_eq!(kept(27_000, 810, "prune_until = 27500"), 10);
     // Prunes after the run's last step do not count.
-    assert_eq!(left(29_000, 90, "prune_until = 90000"), 30);
+    assert_eq!(kept(29_000, 90, "prune_until = 90000"), 30);
     // The first of the sixteen prunes after growth leaves 810·(1/81)^(1/16) = 615.5.
-    assert_eq!(left(15_000, 810, ""), 615);
-    let one = "victims = \"random\"\nrandom_keep = 1";
-    assert_eq!(run(&event(30_000, &xs[..30]), one).ops.rows_after, 1);
+    assert_eq!(kept(15_000, 810, ""), 615);
+    let keep_one = "victims = \"random\"\nrandom_keep = 1";
+    assert_eq!(run(&event(30_000, &xs[..30]), keep_one).ops.rows_after, 1);
     // During growth the control prunes as many as the real policy would, here none.
-    assert_eq!(left(14_000, 810, "grow_every = 0"), 810);
+    assert_eq!(kept(14_000, 810, "grow_every = 0"), 810);
 }
 
 #[test]

@@ -65,7 +65,7 @@ pub struct PolicyEntry {
     pub name: &'static str,
     /// One-line description.
     pub summary: &'static str,
-    /// Publication.
+    /// The publication that the policy is from.
     pub source: &'static str,
     doc: &'static str,
     place: (&'static str, u32),
@@ -132,8 +132,8 @@ impl PolicyEntry {
     pub fn parameter_names(&self) -> Vec<String> {
         let known = (self.field_names)().unwrap_or_default();
         let mut names: Vec<String> = known.iter().map(|name| (*name).to_owned()).collect();
-        let more = self.defaults().unwrap_or_default().into_iter().map(|(name, _)| name);
-        names.extend(more.filter(|name| !known.contains(&name.as_str())));
+        let in_defaults = self.defaults().unwrap_or_default().into_iter().map(|(name, _)| name);
+        names.extend(in_defaults.filter(|name| !known.contains(&name.as_str())));
         names
     }
 

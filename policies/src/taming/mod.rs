@@ -53,7 +53,7 @@
 //! | grow_every | 500 | >= 0 | steps | interval of growth; 0: never |
 //! | multiplier | 0.0 | >= 0 | initial Gaussians | final number of Gaussians; 0: the budget |
 //! | tau | 0.0002 | >= 0 | 1 / NDC | screen gradient from which a Gaussian is a candidate |
-//! | small | 0.01 | >= 0 | scene extent | largest size that is cloned; larger ones are split |
+//! | small | 0.01 | >= 0 | scene extent | Gaussians up to this size are cloned, larger ones split |
 //! | split_factor | 1.6 | 1 to 100 | | a split divides the scales by this |
 //! | views | 10 | >= 0 | views | views rendered per event; 0: all |
 //! | error_weight | 50.0 | >= 0 | | weight of the error in M_v |

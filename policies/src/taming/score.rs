@@ -60,16 +60,16 @@ impl Score {
         if self.step != now.step || self.loss_sums.len() != now.rows() {
             return Ok(vec![0.0; now.rows()]);
         }
-        let mut own = vec![0.0; now.rows()];
-        add_term(&mut own, params.gradient_weight as f32, gradient);
-        add_term(&mut own, params.opacity_weight as f32, now.signal(Signal::Opacity)?);
-        add_term(&mut own, params.scale_weight as f32, now.signal(Signal::ScaleProduct)?);
-        let parts = self.view_terms.iter().zip(&self.loss_sums).zip(own);
-        Ok(parts.map(|((terms, losses), own)| terms + losses * own).collect())
+        let mut row_terms = vec![0.0; now.rows()];
+        add_term(&mut row_terms, params.gradient_weight as f32, gradient);
+        add_term(&mut row_terms, params.opacity_weight as f32, now.signal(Signal::Opacity)?);
+        add_term(&mut row_terms, params.scale_weight as f32, now.signal(Signal::ScaleProduct)?);
+        let parts = self.view_terms.iter().zip(&self.loss_sums).zip(row_terms);
+        Ok(parts.map(|((terms, losses), row_terms)| terms + losses * row_terms).collect())
     }
 }
 
-/// Adds `weight` · x / median of the positive x, for positive x.
+/// Adds to each sum `weight` · x / (median of the positive x) if its x is positive.
 fn add_term(sums: &mut [f32], weight: f32, values: &[f32]) {
     let Some(median) = median_of_positive(values) else { return };
     for (sum, &x) in sums.iter_mut().zip(values) {
@@ -92,7 +92,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn terms_are_relative_to_the_median_of_the_positive() {
+    fn terms_are_relative_to_the_median_of_the_positive_values() {
         // Positive: 1, 2, 4, 8; the lower median is 2.
         let mut sums = vec![1.0; 7];
         add_term(&mut sums, 10.0, &[8.0, -1.0, 1.0, 0.0, 4.0, f32::NAN, 2.0]);

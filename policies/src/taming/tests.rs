@@ -19,7 +19,7 @@ fn event(step: u32, rows: usize, budget: usize) -> Event {
     event
 }
 
-fn set(view: &mut View, column: AuxColumn, values: &[f32]) {
+fn set_column(view: &mut View, column: AuxColumn, values: &[f32]) {
     for (name, old) in &mut view.columns {
         if *name == column {
             *old = values.to_vec();
@@ -48,8 +48,8 @@ fn score(event: &Event, set: &str) -> Vec<f32> {
 fn the_score_is_the_weighted_sum_of_its_terms() {
     // All terms at their medians: 50·0.02·(25 + 100 + 5 + 10 + 25 + 50 + 10 + 0.1 + 50) = 275.1.
     let mut event = event(1000, 3, 9);
-    for found in score(&event, "") {
-        assert!((found - 275.1).abs() < 1e-3, "{found}");
+    for total in score(&event, "") {
+        assert!((total - 275.1).abs() < 1e-3, "{total}");
     }
     // One column at a time is doubled in row 1, which adds its coefficient.
     let coefficients = [
@@ -62,24 +62,24 @@ fn the_score_is_the_weighted_sum_of_its_terms() {
     ];
     for (column, coefficient) in coefficients {
         let mut doubled = event.clone();
-        set(&mut doubled.views[0], column, &[2.0, 4.0, 2.0]);
-        let found = score(&doubled, "");
-        assert!((found[1] - 275.1 - coefficient).abs() < 1e-3, "{column:?}: {}", found[1]);
+        set_column(&mut doubled.views[0], column, &[2.0, 4.0, 2.0]);
+        let scores = score(&doubled, "");
+        assert!((scores[1] - 275.1 - coefficient).abs() < 1e-3, "{column:?}: {}", scores[1]);
     }
     let row_terms =
         [(Signal::ScreenGradient, 25.0), (Signal::Opacity, 100.0), (Signal::ScaleProduct, 25.0)];
     for (signal, coefficient) in row_terms {
         let doubled = event.clone().with(signal, &[0.25, 0.5, 0.25]);
-        let found = score(&doubled, "");
-        assert!((found[1] - 275.1 - coefficient).abs() < 1e-3, "{signal:?}: {}", found[1]);
+        let scores = score(&doubled, "");
+        assert!((scores[1] - 275.1 - coefficient).abs() < 1e-3, "{signal:?}: {}", scores[1]);
     }
-    // A second view with half the loss, in which row 0 is not visible.
+    // A second view with half the loss, in which row 0 is not visible: row 1 gets 1.5 · 275.1 = 412.65.
     let mut second = event.views[0].clone();
     second.loss = 0.01;
-    set(&mut second, AuxColumn::Radius, &[0.0, 2.0, 2.0]);
+    set_column(&mut second, AuxColumn::Radius, &[0.0, 2.0, 2.0]);
     event.views.push(second);
-    let found = score(&event, "");
-    assert!((found[0] - 275.1).abs() < 1e-3 && (found[1] - 1.5 * 275.1).abs() < 1e-3, "{found:?}");
+    let scores = score(&event, "");
+    assert!((scores[0] - 275.1).abs() < 1e-3 && (scores[1] - 412.65).abs() < 1e-3, "{scores:?}");
 }
 
 #[test]
@@ -128,10 +128,10 @@ fn small_and_large_rows_share_the_growth() {
 
 #[test]
 fn only_rows_with_a_score_are_drawn() {
-    // Rows that no view shows have no score and are never drawn.
+    // Rows that are visible in no view (with a radius of 0) have no score and are never drawn.
     let mut event = event(1000, 100, 942);
-    let shown: Vec<f32> = (0..100).map(|row| if row % 2 == 0 { 2.0 } else { 0.0 }).collect();
-    set(&mut event.views[0], AuxColumn::Radius, &shown);
+    let radii: Vec<f32> = (0..100).map(|row| if row % 2 == 0 { 2.0 } else { 0.0 }).collect();
+    set_column(&mut event.views[0], AuxColumn::Radius, &radii);
     let done = run(&event, "");
     // All 50 rows with a score grow, although the curve allows 57.
     assert_eq!(done.cloned.len(), 50);
@@ -139,12 +139,12 @@ fn only_rows_with_a_score_are_drawn() {
 }
 
 #[test]
-fn half_of_the_dead_are_pruned() {
+fn half_of_the_dead_rows_are_pruned() {
     let mut opacity = [0.5; 20];
     opacity[..5].fill(0.004);
     let event = event(1000, 20, 20).with(Signal::Opacity, &opacity);
     let done = run(&event, "");
-    // ⌊5/2⌋ = 2 of the five.
+    // ⌊5/2⌋ = 2 of the five dead rows.
     assert_eq!(done.ops.counts, EditCounts { removed: 2, added: 0, updated: 0, denied: 0 });
     assert!(done.pruned.iter().all(|row| *row < 5));
     assert_eq!(run(&event, "prune_share = 1").pruned, [0, 1, 2, 3, 4]);
@@ -153,9 +153,9 @@ fn half_of_the_dead_are_pruned() {
     assert_eq!(run(&Event { step: 14_000, ..event.clone() }, "").pruned.len(), 2);
     // Rows with a low score are drawn more often; row 0 has none, so it is drawn.
     let mut scored = event.clone();
-    let mut shown = vec![2.0; 20];
-    shown[0] = 0.0;
-    set(&mut scored.views[0], AuxColumn::Radius, &shown);
+    let mut radii = vec![2.0; 20];
+    radii[0] = 0.0;
+    set_column(&mut scored.views[0], AuxColumn::Radius, &radii);
     assert!(run(&scored, "").pruned.contains(&0));
     // Pruning by size, after step 3000.
     let mut scale = [0.05; 20];
@@ -166,7 +166,7 @@ fn half_of_the_dead_are_pruned() {
 }
 
 #[test]
-fn the_dead_do_not_grow() {
+fn dead_rows_do_not_grow() {
     let event = event(14_500, 4, 1000).with(Signal::Opacity, &[0.5, 0.004, 0.5, f32::NAN]);
     let mut cloned = run(&event, "").cloned;
     cloned.sort_unstable();
@@ -190,9 +190,9 @@ fn the_published_draw_prunes_fewer_and_other_rows() {
     let mut opacity = [0.5; 400];
     opacity[4] = 0.004;
     opacity[9] = 0.004;
-    let mut shown = vec![2.0; 400];
-    shown[2] = 0.0;
-    set(&mut event.views[0], AuxColumn::Radius, &shown);
+    let mut radii = vec![2.0; 400];
+    radii[2] = 0.0;
+    set_column(&mut event.views[0], AuxColumn::Radius, &radii);
     let mut event = Event { budget: 1000, ..event }
         .with(Signal::Opacity, &opacity)
         .with(Signal::ScreenGradient, &gradient)

@@ -42,7 +42,7 @@
 //! | grow_until | 15000 | >= 0 | step | end of growth, pruning and opacity resets (exclusive) |
 //! | grow_every | 100 | >= 0 | steps | interval of growth and pruning; 0: never |
 //! | tau | 0.0002 | >= 0 | 1 / NDC | screen gradient from which a Gaussian is densified |
-//! | small | 0.01 | >= 0 | scene extent | largest size that is cloned; larger ones are split |
+//! | small | 0.01 | >= 0 | scene extent | Gaussians up to this size are cloned, larger ones split |
 //! | split_factor | 1.6 | 1 to 100 | | a split divides the scales by this |
 //! | min_opacity | 0.005 | 0 to 1 | | Gaussians below this opacity are pruned |
 //! | max_scale | 0.1 | > 0 | scene extent | Gaussians above this size are pruned |

@@ -15,7 +15,7 @@ fn event(step: u32, gradient_sums: &[f32], budget: usize) -> Event {
 
 #[test]
 fn the_threshold_applies_to_the_mean_over_views() {
-    // Means over 4 views: 2e-4 (just enough), below, 1e-3; a row that no view saw.
+    // Means over 4 views: just above 2e-4, just below it, 1e-3; no view saw the last row.
     let event = event(600, &[8.01e-4, 7.99e-4, 4e-3, 1.0], 100)
         .with(Signal::VisibleCount, &[4.0, 4.0, 4.0, 0.0]);
     let done = run(&event, "");
@@ -56,7 +56,7 @@ fn faint_rows_are_pruned_and_do_not_grow() {
 
 #[test]
 fn huge_rows_are_pruned_after_step_3000_unless_a_split_makes_them_small() {
-    // Limit 1.0. Row 2 would have children of 0.9375, row 3 of 1.25.
+    // The limit is 1.0. Row 2 would have children of size 0.9375, row 3 of size 1.25.
     let event =
         event(3000, &[0.0, 0.0, 9.0, 9.0], 100).with(Signal::ScaleMax, &[1.0, 1.01, 1.5, 2.0]);
     let early = run(&event, "");

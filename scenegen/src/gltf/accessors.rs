@@ -20,12 +20,15 @@ pub(super) struct Buffers<'a> {
     path: &'a Path,
     root: &'a json::Root,
     folder: Folder,
+    /// The binary chunk of a `.glb` file.
     blob: Option<&'a [u8]>,
+    /// The bytes of each buffer, once it has been read.
     read: Vec<Option<Cow<'a, [u8]>>>,
 }
 
 /// An accessor's elements as numbers.
 pub(super) struct Floats {
+    /// Number of components per element.
     size: usize,
     values: Vec<f32>,
 }
@@ -55,6 +58,7 @@ impl Floats {
 /// Type and number of an accessor's elements.
 struct Layout {
     component: ComponentType,
+    /// Number of components per element.
     size: usize,
     count: usize,
     normalised: bool,
@@ -66,7 +70,7 @@ impl<'a> Buffers<'a> {
         root: &'a json::Root,
         blob: Option<&'a [u8]>,
     ) -> Result<Self, Error> {
-        let folder = Folder::around(path)?;
+        let folder = Folder::containing(path)?;
         Ok(Self { path, root, folder, blob, read: vec![None; root.buffers.len()] })
     }
 
@@ -278,7 +282,7 @@ fn word<const N: usize>(bytes: &[u8]) -> [u8; N] {
     bytes.try_into().unwrap_or([0; N])
 }
 
-/// A component as a number (glTF 2.0, 3.11: normalised integers).
+/// A component as a number. Normalised integers become fractions (glTF 2.0, 3.11).
 fn number(component: ComponentType, normalised: bool, bytes: &[u8]) -> f32 {
     let (value, full) = match component {
         ComponentType::I8 => (f32::from(i8::from_le_bytes(word(bytes))), 127.0),

@@ -122,7 +122,7 @@ impl Reader<'_> {
             return Err(self.fault(name, "there is no such texture"));
         };
         let uv_set = used.transform.and_then(|t| t.tex_coord).unwrap_or(used.uv_set);
-        // The gltf crate's index for a missing source: the image is defined by an extension.
+        // The gltf crate reads a missing source as this index; an extension then defines the image.
         let unsupported = if texture.source.value() == u32::MAX as usize {
             Some("its image is defined by an extension")
         } else {
@@ -152,14 +152,14 @@ impl Reader<'_> {
                 }
             },
         };
-        let mut found = TextureRef { uv_set: uv_set as usize, sampler, ..TextureRef::new(number) };
+        let mut usage = TextureRef { uv_set: uv_set as usize, sampler, ..TextureRef::new(number) };
         if let Some(t) = used.transform {
             let ([x, y], [sx, sy], angle) = (t.offset.0, t.scale.0, t.rotation.0);
-            // Counter-clockwise in an image whose v points down.
+            // The rotation is counter-clockwise in an image whose v points down.
             let (sin, cos) = angle.sin_cos();
-            found.transform = [[sx * cos, sy * sin, x], [-sx * sin, sy * cos, y]];
+            usage.transform = [[sx * cos, sy * sin, x], [-sx * sin, sy * cos, y]];
         }
-        Ok(Some(found))
+        Ok(Some(usage))
     }
 
     fn image(&mut self, index: usize, srgb: bool) -> Result<Texture, Error> {

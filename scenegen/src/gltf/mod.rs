@@ -4,8 +4,8 @@
 //! crate's readers do not check them. Everything that places surfaces is applied or refused, except animations:
 //! nodes stay where the file places them. Occlusion textures are ignored, as the tracer can compute occlusion.
 //!
-//! Errors that cannot change the result are ignored: alignments, bounds of accessors, targets of
-//! buffer views, names of attributes that are not read, morph targets without weight, and objects that the
+//! Errors that cannot change the result are ignored: those in alignments, in bounds of accessors, in targets of
+//! buffer views, in names of attributes that are not read, in morph targets without weight, and in objects that the
 //! scene does not use. `tests/malformed.tsv` lists the outcome for each test file of a validator.
 
 mod accessors;
@@ -25,10 +25,11 @@ use crate::mesh::Model;
 use crate::resource;
 use accessors::Buffers;
 
-/// Largest JSON part `[bytes]`. (serde_json limits its depth to 128.)
+/// Largest JSON part `[bytes]`. (serde_json limits the depth of its nesting to 128.)
 const MAX_JSON: usize = 64 << 20;
 /// Maximum number of nodes, meshes, accessors, buffers, images or materials.
 const MAX_ITEMS: usize = 1_000_000;
+/// The remedy for damaged files.
 const REMEDY: &str = "correct the file or export it again";
 /// Extensions that are applied.
 const SUPPORTED: [&str; 7] = [
@@ -84,7 +85,7 @@ pub(crate) fn load(path: &Path) -> Result<Model, Error> {
     }
     refuse_unsupported(path, text)?;
     let root = parse(path, text)?;
-    for (what, count) in [
+    for (kind, count) in [
         ("nodes", root.nodes.len()),
         ("meshes", root.meshes.len()),
         ("accessors", root.accessors.len()),
@@ -93,7 +94,7 @@ pub(crate) fn load(path: &Path) -> Result<Model, Error> {
         ("materials", root.materials.len()),
     ] {
         if count > MAX_ITEMS {
-            return Err(fault(path, what, "there are more than a million"));
+            return Err(fault(path, kind, "there are more than a million"));
         }
     }
     let mut reader = Reader {
@@ -104,7 +105,7 @@ pub(crate) fn load(path: &Path) -> Result<Model, Error> {
         images: HashMap::new(),
         model: Model::default(),
     };
-    reader.notes();
+    reader.add_notes();
     reader.scene()?;
     reader.model.finish(path)
 }
@@ -135,7 +136,7 @@ fn parse(path: &Path, text: &[u8]) -> Result<json::Root, Error> {
     json::deserialize::from_slice(&rewritten).map_err(|_| error)
 }
 
-/// Removes `extras`, and writes integers without a fraction.
+/// Removes `extras`, and writes whole numbers as integers.
 fn normalise(value: &mut Value) {
     match value {
         Value::Array(list) => list.iter_mut().for_each(normalise),
@@ -144,7 +145,7 @@ fn normalise(value: &mut Value) {
             map.values_mut().for_each(normalise);
         }
         Value::Number(number) => {
-            // Beyond 2^53 not every integer is a float.
+            // Floats above 2^53 cannot represent every integer.
             let float = number.as_f64().filter(|v| v.fract() == 0.0 && (0.0..9e15).contains(v));
             if let Some(float) = float {
                 *value = Value::from(float as u64);
@@ -229,7 +230,7 @@ fn refuse_unsupported(path: &Path, text: &[u8]) -> Result<(), Error> {
     Ok(())
 }
 
-/// How to do without an extension.
+/// The remedy for a file that needs an unsupported extension.
 fn remedy(extension: &str) -> &'static str {
     match extension {
         DRACO => "export the mesh without Draco compression",
@@ -248,7 +249,8 @@ impl Reader<'_> {
         fault(self.path, element, problem)
     }
 
-    fn notes(&mut self) {
+    /// Notes the contents of the file that are ignored.
+    fn add_notes(&mut self) {
         let ignored = self.root.extensions_used.iter();
         let ignored: Vec<_> = ignored.filter(|name| !SUPPORTED.contains(&name.as_str())).collect();
         let notes = &mut self.model.notes;

@@ -17,7 +17,7 @@ pub(super) const VISIBILITY: &str = "KHR_node_visibility";
 /// Maximum depth of the node hierarchy.
 const MAX_DEPTH: usize = 256;
 
-/// The places of a mesh in the world.
+/// Where a mesh is placed in the world.
 pub(super) enum Places {
     /// A transform from the mesh to the world for each instance.
     Instances(Vec<DAffine3>),
@@ -45,7 +45,7 @@ impl Reader<'_> {
                 return Err(self.fault(format!("scene {number}"), "there is no such scene"));
             }
             None => {
-                // Without scenes, all nodes that have no parent.
+                // A file without scenes: its roots are all nodes without a parent.
                 let mut is_child = vec![false; root.nodes.len()];
                 for child in root.nodes.iter().flat_map(|node| node.children.iter().flatten()) {
                     if let Some(mark) = is_child.get_mut(child.value()) {
@@ -124,8 +124,8 @@ impl Reader<'_> {
         Ok(())
     }
 
-    /// For each joint of a skin, the transform from the mesh to the world. The transform of the mesh's own node does
-    /// not count (glTF 2.0, 3.7.3.2).
+    /// For each joint of a skin, the transform from the mesh to the world. The transform of the mesh's own node is
+    /// ignored (glTF 2.0, 3.7.3.2).
     fn joints(
         &mut self,
         index: usize,
@@ -252,7 +252,7 @@ fn extension<'a>(node: &'a json::Node, name: &str) -> Option<&'a Value> {
     node.extensions.as_ref()?.others.get(name)
 }
 
-/// The transform of a matrix given by its columns.
+/// The transform of a 4×4 matrix given by its columns.
 fn affine(columns: &[f32; 16]) -> DAffine3 {
     DAffine3::from_mat4(DMat4::from_cols_array(&columns.map(f64::from)))
 }

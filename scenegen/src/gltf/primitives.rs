@@ -31,6 +31,7 @@ impl Source<'_> {
 }
 
 impl Reader<'_> {
+    /// Adds the triangles of a primitive to the model, placed in the world by `places`.
     pub(super) fn primitive(
         &mut self,
         primitive: &Primitive,
@@ -52,7 +53,7 @@ impl Reader<'_> {
         let morphs = self.morphs(primitive, element, weights)?;
         let source = Source { primitive, element, morphs };
         let Some(positions) = self.attribute(&source, Semantic::Positions, &[3], None)? else {
-            // Valid (glTF 2.0, 3.7.2.1).
+            // This is valid (glTF 2.0, 3.7.2.1).
             let note = format!("{element} has no positions and is not rendered");
             self.model.notes.push(note);
             return Ok(());

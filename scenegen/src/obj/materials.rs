@@ -35,7 +35,7 @@ impl Materials {
     pub(super) fn new(obj: &Path) -> Result<Self, Error> {
         let (indices, textures) = (HashMap::new(), HashMap::new());
         let (uncoloured, model) = (HashSet::new(), Model::default());
-        Ok(Self { folder: Folder::around(obj)?, indices, textures, uncoloured, model })
+        Ok(Self { folder: Folder::containing(obj)?, indices, textures, uncoloured, model })
     }
 
     /// The model's index of a material. An undefined material is noted once.
@@ -201,15 +201,15 @@ impl Materials {
                 number
             }
         };
-        let mut found = TextureRef::new(number);
+        let mut usage = TextureRef::new(number);
         if map.clamp {
-            found.sampler.wrap_u = Wrap::Clamp;
-            found.sampler.wrap_v = Wrap::Clamp;
+            usage.sampler.wrap_u = Wrap::Clamp;
+            usage.sampler.wrap_v = Wrap::Clamp;
         }
         // Scale and offset assume that v points up.
         let (s, o) = (map.scale, map.offset);
-        found.transform = [[s.x, 0.0, o.x], [0.0, s.y, 1.0 - s.y - o.y]];
-        Ok(found)
+        usage.transform = [[s.x, 0.0, o.x], [0.0, s.y, 1.0 - s.y - o.y]];
+        Ok(usage)
     }
 }
 

@@ -7,13 +7,13 @@
 //!
 //! Faces are visible from both sides. Materials are diffuse unless they have one of the PBR keys `Pr`,
 //! `Pm`, `map_Pr` or `map_Pm`. `norm` is a tangent-space normal map as in glTF; height maps (`bump`,
-//! `map_bump`) are ignored with a note. Where common programs deviate from the format, they are followed: a map
-//! whose factor is 0 is shown, `d` takes precedence over `Tr`, and a `Tr` that would hide a material is ignored.
+//! `map_bump`) are ignored with a note. Where common programs deviate from the format, this reader follows them: a
+//! map whose factor is 0 is shown, `d` takes precedence over `Tr`, and a `Tr` that would hide a material is ignored.
 //!
 //! Vertex colours (`v x y z r g b`) are sRGB, from 0 to 1, or from 0 to 255 if any value is at least 2. They
 //! replace a missing or black colour of materials without a texture.
 //!
-//! A corner without a normal is flat, or smooth within its smoothing group (`s 1`). A smooth normal is the mean
+//! A corner without a normal is shaded flat, or smooth within its smoothing group (`s 1`). A smooth normal is the mean
 //! of the normals of the group's faces, weighted by their angles (Thürmer and Wüthrich, "Computing Vertex
 //! Normals from Polygonal Facets", 1998).
 
@@ -61,7 +61,7 @@ struct Reader {
     triangles: usize,
     /// Faces that are not yet in the model.
     block: Block,
-    /// The model's vertices.
+    /// The model's vertex for each distinct corner.
     vertices: HashMap<Corner, u32>,
     /// Sums of face normals weighted by angles, by position and smoothing group.
     sums: HashMap<(u32, u32), DVec3>,
@@ -132,7 +132,7 @@ impl Reader {
             let vertex = self.positions.len() + 1;
             return Err(statement.fault(format!("vertex {vertex} is not finite")));
         }
-        // x y z r g b, or x y z w r g b.
+        // The numbers are x y z r g b, or x y z w r g b.
         if let &([r, g, b] | [_, r, g, b]) = &statement.numbers(8)?[3..] {
             let rgb = DVec3::new(r, g, b).as_vec3();
             if rgb.max_element() > 255.0 {
@@ -173,7 +173,7 @@ impl Reader {
             self.add_block(statement.path)?;
             (self.block.material, self.block.group) = (material, group);
         }
-        // Every corner gets all attributes, as `tobj` would mix up those that only some have.
+        // Every corner gets all attributes, as `tobj` would mix up attributes that only some corners have.
         self.block.add(&corners, |i, number| {
             let index = number.wrapping_sub(1);
             if i == 0 {
@@ -195,21 +195,21 @@ impl Reader {
         let mut numbers = [0; 3];
         let counts = [self.positions.len(), self.uvs.len(), self.normals.len()];
         let fields = numbers.iter_mut().zip(counts).zip(["vertex", "texture", "normal"]);
-        for (((number, count), what), text) in fields.zip(word.split('/')) {
+        for (((number, count), kind), text) in fields.zip(word.split('/')) {
             if text.is_empty() {
                 continue;
             }
             let value: i64 = text.parse().map_err(|_| {
-                statement.fault(format!("{:?} is not a {what} index", shortened(text)))
+                statement.fault(format!("{:?} is not a {kind} index", shortened(text)))
             })?;
             // Negative indices count back from the last element.
-            let found = if value < 0 { count as i64 + 1 + value } else { value };
-            *number = u32::try_from(found)
+            let index = if value < 0 { count as i64 + 1 + value } else { value };
+            *number = u32::try_from(index)
                 .ok()
-                .filter(|&found| (1..=count).contains(&(found as usize)))
+                .filter(|&index| (1..=count).contains(&(index as usize)))
                 .ok_or_else(|| {
                     let problem = format!("is out of range: the file has {count} so far");
-                    statement.fault(format!("{what} index {value} {problem}"))
+                    statement.fault(format!("{kind} index {value} {problem}"))
                 })?;
         }
         if numbers[0] == 0 {

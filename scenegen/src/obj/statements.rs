@@ -65,7 +65,7 @@ pub(super) fn for_each(
     loop {
         text.clear();
         let line = lines + 1;
-        // A backslash at the end continues a line.
+        // A backslash at the end of a line continues it.
         loop {
             let room = MAX_LINE - text.len() as u64;
             let count = (&mut file).take(room + 1).read_until(b'\n', &mut text);

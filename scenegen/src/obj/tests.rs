@@ -88,7 +88,7 @@ fn maps_of_roughness_and_metalness_are_read() {
     assert!((value(&material.roughness_texture).y - 0.2).abs() < 1e-6);
     assert!((value(&material.metallic_texture).z - 0.8).abs() < 1e-6);
     assert!(model.notes.iter().any(|note| note.contains("bump")), "{:?}", model.notes);
-    // Without a map the number applies; the default is no metal.
+    // Without a map the number applies; by default, the metalness is 0.
     let model = load("newmtl m\nmap_Pr r.png\n");
     let material = &model.materials[0];
     assert_eq!((material.roughness, material.metallic), (1.0, 0.0));
@@ -133,7 +133,7 @@ fn vertices_without_a_valid_colour_are_white() {
     assert_eq!(colours, [Vec4::new(quarter, 0.0, 0.0, 1.0), Vec4::ONE, Vec4::ONE]);
 }
 
-/// A PNG of one grey and one alpha.
+/// A PNG image of one grey value and one alpha value.
 fn png(grey: u8, alpha: u8) -> Vec<u8> {
     let mut bytes = Cursor::new(Vec::new());
     let image = image::GrayAlphaImage::from_pixel(2, 2, image::LumaA([grey, alpha]));
@@ -141,11 +141,11 @@ fn png(grey: u8, alpha: u8) -> Vec<u8> {
     bytes.into_inner()
 }
 
-/// A triangle with material `m` of this library, which may use the images `t.png` and `a.png`. The numbers `more`
+/// A triangle with material `m` of this library, which may use the images `t.png` and `a.png`. The numbers `colour`
 /// follow each vertex's position.
-fn painted(more: &str, library: &str) -> Model {
+fn painted(colour: &str, library: &str) -> Model {
     let obj = format!(
-        "mtllib a.mtl\nv 0 0 0 {more}\nv 1 0 0 {more}\nv 0 1 0 {more}\nvt 0 0\nusemtl m\nf 1/1 2/1 3/1\n"
+        "mtllib a.mtl\nv 0 0 0 {colour}\nv 1 0 0 {colour}\nv 0 1 0 {colour}\nvt 0 0\nusemtl m\nf 1/1 2/1 3/1\n"
     );
     let (t, a) = (png(128, 51), png(204, 255));
     let files: [(&str, &[u8]); 3] = [("a.mtl", library.as_bytes()), ("t.png", &t), ("a.png", &a)];
@@ -155,7 +155,7 @@ fn painted(more: &str, library: &str) -> Model {
 #[test]
 fn vertex_colours_are_srgb_from_0_to_255_or_0_to_1() {
     let grey = linear_from_srgb(128.0 / 255.0) as f32;
-    for (more, expected) in [
+    for (colour, expected) in [
         ("128 128 128", grey),
         ("127.5 127.5 127.5", linear_from_srgb(0.5) as f32),
         ("0.5019608 0.5019608 0.5019608", grey),
@@ -164,10 +164,10 @@ fn vertex_colours_are_srgb_from_0_to_255_or_0_to_1() {
         ("1 1 1", 1.0),
     ] {
         for library in ["newmtl m\n", "newmtl m\nKd 0 0 0\n", "newmtl m\nKd 1 1 1\n", ""] {
-            let model = painted(more, library);
+            let model = painted(colour, library);
             let base = model.materials[model.triangle_materials[0] as usize].base.truncate();
-            let seen = base * model.colours[0].truncate();
-            assert!((seen - expected).abs().max_element() < 1e-6, "{more}, {library}: {seen}");
+            let shown = base * model.colours[0].truncate();
+            assert!((shown - expected).abs().max_element() < 1e-6, "{colour}, {library}: {shown}");
         }
     }
     let error = loaded("v 0 0 0 1 1 256\n", &[]).expect_err("no colour").to_string();

@@ -1,8 +1,8 @@
 //! Environment light from an equirectangular image: Radiance `.hdr` or OpenEXR.
 //!
 //! +y is up. Seen from inside, the centre of the image is towards +x and its right half towards +z. Files are
-//! untrusted: sizes are checked before anything is decoded, NaN becomes black, and infinity the largest half
-//! float.
+//! untrusted: sizes are checked before anything is decoded, NaN becomes 0, and infinity becomes the largest
+//! half float.
 //!
 //! Blurred copies are made once, so that light without occlusion needs no secondary rays. Each copy is the
 //! image averaged with a power of the cosine as weight. The exponent k for a roughness is chosen such that the
@@ -21,8 +21,8 @@ use crate::resource::{self, EXPANSION, MAX_DECODED};
 
 /// Largest radiance: the largest half float.
 const BRIGHTEST: f32 = 65_504.0;
-/// Number of columns of the image that is averaged; it has half as many rows. `CELLS` and `AVERAGES` are sufficient
-/// for the sharpest lobe, which is about 20 degrees wide.
+/// Number of columns of the reduced image that is averaged; it has half as many rows. `CELLS` and `AVERAGES` are
+/// sufficient for the sharpest lobe, which is about 20 degrees wide.
 const CELLS: usize = 96;
 /// Number of columns of a blurred copy.
 const AVERAGES: usize = 48;
@@ -37,7 +37,7 @@ pub struct Panorama {
     blurred: Vec<Sphere>,
 }
 
-/// Radiance by direction.
+/// An equirectangular map of radiance by direction.
 #[derive(Debug)]
 struct Sphere {
     width: usize,
@@ -59,8 +59,8 @@ impl Panorama {
     /// Reads a file.
     ///
     /// # Errors
-    /// When it cannot be read, is not an `.hdr` or `.exr` image of moderate size, or is not twice as wide
-    /// as high.
+    /// When it cannot be read, is not an `.hdr` or `.exr` image of at most 11584 px width, or is not twice as wide as
+    /// high.
     pub fn load(path: &Path) -> Result<Self, Error> {
         let bytes = resource::read(path)?;
         let remedy = "use an equirectangular .hdr or .exr image, at most 11584 px wide";

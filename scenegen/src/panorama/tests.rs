@@ -22,7 +22,7 @@ fn panorama(width: usize, radiance: impl Fn(Vec3) -> Vec3) -> Panorama {
 }
 
 #[test]
-fn an_image_of_one_colour_is_the_uniform_sky() {
+fn an_image_of_one_colour_acts_like_a_uniform_sky() {
     let uniform = Sky::uniform(0.7);
     for width in [2, 64, 200] {
         let image = Sky::Image(panorama(width, |_| Vec3::splat(0.7)).into());
@@ -48,14 +48,14 @@ fn an_image_of_a_gradient_lights_like_the_gradient() {
     let mut draws = Draws::new(6, &[]);
     for _ in 0..500 {
         let d = unit(&mut draws);
-        for (a, b, most) in [
+        for (a, b, tolerance) in [
             (image.radiance(d), gradient.radiance(d), 0.02),
             (image.irradiance(d) / PI, gradient.irradiance(d) / PI, 0.004),
             (image.blurred(d, 1.0), gradient.blurred(d, 1.0), 0.004),
             (image.blurred(d, 0.5), gradient.blurred(d, 0.5), 0.004),
             (image.blurred(d, 0.6), gradient.blurred(d, 0.6), 0.02),
         ] {
-            assert!((a - b).abs().max_element() < most, "{d}: {a}, not {b}");
+            assert!((a - b).abs().max_element() < tolerance, "{d}: {a}, not {b}");
         }
     }
 }

@@ -19,7 +19,7 @@ const CANDIDATES: f64 = 2.0;
 const GRADIENT_FLOOR: f64 = 0.5;
 /// Side of the cubes that are dropped as a whole, as a share of the diagonal.
 const PATCH: f64 = 0.02;
-/// Relative depth difference up to which a view sees a point.
+/// Largest relative difference between a point's depth and the visible depth at which a view sees the point.
 const SAME_DEPTH: f64 = 1e-3;
 
 /// Number and errors of initial points.
@@ -29,9 +29,9 @@ pub struct PointOptions {
     pub count: usize,
     /// Standard deviation of the noise on each coordinate, as a share of the diagonal.
     pub noise: f64,
-    /// Share of points that are placed anywhere in the bounding box enlarged by a fifth.
+    /// Share of points that are placed at random in the bounding box enlarged by a fifth.
     pub outliers: f64,
-    /// Share of space, in cubes of 2 % of the diagonal, without points.
+    /// Share of space without points. Space is divided into cubes with sides of 2 % of the diagonal.
     pub dropout: f64,
     /// If true, thin structures yield no points.
     pub without_thin: bool,
@@ -50,11 +50,11 @@ pub struct InitPoints {
     pub positions: Vec<DVec3>,
     /// sRGB colours. Shape: `[points]`.
     pub colours: Vec<[u8; 3]>,
-    /// The surface points that `positions` were before noise or, for outliers, before their displacement, in world
-    /// coordinates. Image features are projections of these. Shape: `[points]`.
+    /// World positions on the surface, from which `positions` differ by noise or, for outliers, by a displacement.
+    /// Image features are projections of these. Shape: `[points]`.
     pub found_at: Vec<DVec3>,
-    /// Indices of the training views that see each point of `found_at` and have that of `positions` in front of their
-    /// camera, ascending. Shape: `[points]`.
+    /// Indices of the training views that see each point of `found_at` and have its point of `positions` in front of
+    /// their camera, ascending. Shape: `[points]`.
     pub seen_by: Vec<Vec<u32>>,
     /// Number of outliers.
     pub outliers: usize,
@@ -150,7 +150,7 @@ impl<'a> PointCollector<'a> {
         let mut points = InitPoints::default();
         self.candidates.sort_by_key(|candidate| candidate.order);
         let needed = MIN_VIEWS.min(self.cameras.len());
-        // In blocks, so that visibility is tested only until there are enough points.
+        // Candidates are tested in blocks, so that visibility is computed only until there are enough points.
         for block in self.candidates.chunks(4096) {
             let seen: Vec<Vec<u32>> = block.par_iter().map(|c| self.viewers(c.position)).collect();
             for (candidate, seen) in block.iter().zip(seen) {

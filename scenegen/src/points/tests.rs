@@ -50,7 +50,8 @@ fn noise_and_outliers_have_the_requested_size() {
         .map(|&p| scene.surface.nearest(p).distance / scene.surface.diagonal())
         .collect();
     distances.sort_by(f64::total_cmp);
-    // The distance from a plane is the noise along its normal: its median is 0.674 deviations.
+    // The distance of a point from its plane is the noise along the normal, with a median of 0.674 standard deviations.
+    // The outliers, a tenth of the points, are the farthest.
     let median = distances[distances.len() * 45 / 100] / 2e-3;
     assert!((0.5..0.8).contains(&median), "{median}");
 }
@@ -68,7 +69,7 @@ fn detail_has_more_points_than_plain_walls() {
 }
 
 #[test]
-fn thin_structures_and_patches_are_left_out_on_request() {
+fn thin_structures_and_patches_are_excluded_on_request() {
     let on_thin = |scene: &Scene, points: &InitPoints| {
         let thin = |p: &&DVec3| scene.model.is_thin(scene.surface.nearest(**p).triangle);
         points.positions.iter().filter(thin).count()

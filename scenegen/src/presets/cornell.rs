@@ -47,7 +47,7 @@ fn build() -> Staging {
     let rig = Rig {
         kind: RigKind::Orbit,
         arc: 45.0,
-        // Every pixel costs 64 rays and their shadows.
+        // Every pixel costs 64 rays and their shadow rays.
         width: 128,
         height: 128,
         elevation: [-12.0, 20.0],

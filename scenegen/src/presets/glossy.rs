@@ -1,8 +1,8 @@
 //! `glossy`: view-dependent colours.
 //!
-//! A plate |x|, |z| <= 1.5 at y = 0 (Lambert, chequered), on it nine spheres of radius 0.22 on a grid
-//! of 0.6 m, GGX: metalness 0, 0.5 and 1 along z, roughness 0.15, 0.35 and 0.6 along x; 5,120 triangles
-//! each with smooth normals. They reflect sun and sky, but not each other.
+//! A plate |x|, |z| <= 1.5 at y = 0 (Lambert, chequered). On it are nine GGX spheres of radius 0.22 m on a grid
+//! of 0.6 m: metalness 0, 0.5 and 1 along z, roughness 0.15, 0.35 and 0.6 along x. Each has 5,120 triangles
+//! with smooth normals. The spheres reflect sun and sky, but not each other.
 
 use glam::{DVec3, Vec3, Vec4};
 

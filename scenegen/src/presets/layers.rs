@@ -87,7 +87,7 @@ fn build() -> Staging {
     };
     // The sky lights the scene in closed form; the dome only depicts it.
     let mut staging = Staging { rig, ..Staging::outdoors(model) };
-    // A sun outside the dome would be occluded by it.
+    // The dome would occlude a sun outside it.
     staging.model.lights = vec![inside_sun()];
     staging
 }

@@ -26,7 +26,7 @@ use crate::sky::Sky;
 pub struct Preset {
     /// Name on the command line.
     pub name: &'static str,
-    /// One line for lists.
+    /// One-line description for lists.
     pub summary: &'static str,
     pub(crate) build: Build,
 }

@@ -1,7 +1,7 @@
 //! `room`: a room from inside. Its walls have no texture except small text.
 //!
 //! The inside of |x| <= 2.5, 0 <= y <= 2.6, |z| <= 2: floor of boards, plain walls and ceiling. Posters
-//! of 0.9 x 0.6 m, 1 cm in front of the middle of each wall at height 1.5 m, with five lines of text whose
+//! of 0.9 x 0.6 m hang 1 cm in front of the middle of each wall at height 1.5 m, with five lines of text whose
 //! strokes are 6 mm wide. A table (top 1.2 x 0.04 x 0.7 m at height 0.72 m, four legs of 5 cm) in the
 //! middle, a shelf (0.8 x 1.8 x 0.3 m) at the wall x = −2.5, a sphere of 0.25 m and a cube of 0.4 m.
 //! Lit by a point light at (0, 1.9, 0) and even ambient light. All Lambert.

@@ -6,7 +6,7 @@ use std::str::FromStr;
 use super::{Build, PRESETS, Preset, Staging};
 use crate::error::Error;
 
-/// A built-in scene and its size. Printed in the form that is parsed; a default size is left out.
+/// A built-in scene and its size. It is printed in the form that is parsed, without the size if that is the default.
 #[derive(Debug, Clone, Copy)]
 pub struct PresetSpec {
     preset: Preset,

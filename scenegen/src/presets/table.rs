@@ -3,7 +3,7 @@
 //! A table top of 1.6 x 0.06 x 1 m whose upper side is y = 0.76, on four legs of 6 x 6 cm, on a
 //! floor |x|, |z| <= 1.5 at y = 0. On it, placed by a fixed seed on a grid of 5 x 3 cells of 30 cm:
 //! boxes (half sides 4 to 11 cm), cylinders (radius 3 to 7 cm, height 8 to 28 cm) and spheres
-//! (radius 4 to 9 cm), each resting on the top; on every third box stands a sphere of 4 cm.
+//! (radius 4 to 9 cm), each resting on the top; on every third box stands a sphere of radius 4 cm.
 //! All Lambert.
 
 use glam::{DQuat, DVec3};

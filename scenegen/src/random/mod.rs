@@ -31,6 +31,7 @@ impl Draws {
         Self { key: mix(self.key ^ mix(part)), count: 0 }
     }
 
+    /// 64 random bits.
     pub(crate) fn bits(&mut self) -> u64 {
         self.count += 1;
         mix(self.key.wrapping_add(self.count.wrapping_mul(0xd134_2543_de82_ef95)))
@@ -58,13 +59,13 @@ impl Draws {
     }
 }
 
-/// The `i`-th of `n` x `n` jittered strata of the unit square.
+/// A point in the `i`-th of `n` x `n` strata of the unit square; `jitter` is its position in the stratum.
 pub(crate) fn stratum(i: u32, n: u32, jitter: Vec2) -> Vec2 {
     let cell = Vec2::new((i % n) as f32, (i / n) as f32);
     (cell + jitter) / n as f32
 }
 
-/// A direction around +z with density cos / pi.
+/// A direction around +z with density cos / pi, if `u` is uniform in the unit square.
 pub(crate) fn cosine_hemisphere(u: Vec2) -> Vec3 {
     let (radius, angle) = (u.x.sqrt(), TAU * u.y);
     Vec3::new(radius * angle.cos(), radius * angle.sin(), (1.0 - u.x).max(0.0).sqrt())

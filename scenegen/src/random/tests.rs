@@ -42,7 +42,7 @@ const TURNS: usize = 24;
 
 /// Bins directions of the upper hemisphere by height and turn, and tests the counts against a density.
 fn check_directions(
-    what: &str,
+    name: &str,
     mut draw: impl FnMut(&mut Draws) -> Vec3,
     density: impl Fn(Vec3) -> f64,
 ) {
@@ -50,7 +50,7 @@ fn check_directions(
     let mut draws = Draws::new(1, &[7]);
     for _ in 0..DRAWS {
         let d = draw(&mut draws);
-        assert!(d.is_finite() && (d.length() - 1.0).abs() < 1e-4 && d.z >= 0.0, "{what}: {d}");
+        assert!(d.is_finite() && (d.length() - 1.0).abs() < 1e-4 && d.z >= 0.0, "{name}: {d}");
         let height = ((d.z * HEIGHTS as f32) as usize).min(HEIGHTS - 1);
         let turn = (d.y.atan2(d.x) / TAU).rem_euclid(1.0);
         counts[height * TURNS + ((turn * TURNS as f32) as usize).min(TURNS - 1)] += 1;
@@ -67,7 +67,7 @@ fn check_directions(
             probabilities[height / FINE * TURNS + turn / FINE] += density(d) * solid_angle;
         }
     }
-    check_distribution(&counts, &probabilities).unwrap_or_else(|e| panic!("{what}: {e}"));
+    check_distribution(&counts, &probabilities).unwrap_or_else(|e| panic!("{name}: {e}"));
 }
 
 #[test]

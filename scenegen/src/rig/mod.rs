@@ -38,11 +38,11 @@ pub enum RigKind {
 /// A camera arrangement with all its parameters.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Rig {
-    /// Arrangement.
+    /// Kind of arrangement.
     pub kind: RigKind,
-    /// Views to train on.
+    /// Number of training views.
     pub train: u32,
-    /// Views held out.
+    /// Number of test views, which are held out.
     pub test: u32,
     /// Image width `[px]`.
     pub width: u32,
@@ -54,7 +54,7 @@ pub struct Rig {
     /// image. For `Inside`, the path's radius as a share of half the room; for `Survey`, a factor on the cameras'
     /// height.
     pub radius: f64,
-    /// Lowest and highest elevation `[degrees]`.
+    /// Lowest and highest elevation of the cameras `[degrees]`.
     pub elevation: [f64; 2],
     /// Range of azimuths, centred on +z `[degrees]`.
     pub arc: f64,
@@ -100,7 +100,7 @@ const GOLDEN: f64 = TAU * 0.381_966_011_250_105;
 /// Number of positions tried for a camera before giving up.
 const ATTEMPTS: u64 = 200;
 
-/// A position and the point that it looks at.
+/// A camera position, and the point that the camera looks at.
 type Viewpoint = (DVec3, DVec3);
 
 impl Rig {
@@ -130,7 +130,7 @@ impl Rig {
     fn check(&self) -> Result<(), Error> {
         for side in [self.width, self.height] {
             if !(1..=16_384).contains(&side) {
-                return Err(Error::option("--size", format!("{side} px is not in 1 to 16384")));
+                return Err(Error::option("--size", format!("{side} is not between 1 and 16384")));
             }
         }
         if u64::from(self.width) * u64::from(self.height) > 1 << 28 {
@@ -138,7 +138,7 @@ impl Rig {
         }
         for (option, least, count) in [("--train", 1, self.train), ("--test", 0, self.test)] {
             if !(least..=100_000).contains(&count) {
-                let problem = format!("{count} views are not in {least} to 100000");
+                let problem = format!("{count} is not between {least} and 100000");
                 return Err(Error::option(option, problem));
             }
         }
@@ -151,7 +151,8 @@ impl Rig {
             return Err(Error::option("--radius", problem));
         }
         if !(self.jitter >= 0.0 && self.jitter <= 0.5) {
-            return Err(Error::option("--jitter", format!("{} is not in 0 to 0.5", self.jitter)));
+            let problem = format!("{} is not between 0 and 0.5", self.jitter);
+            return Err(Error::option("--jitter", problem));
         }
         Ok(())
     }
@@ -259,7 +260,7 @@ impl Rig {
                 let azimuth = TAU * (i + shift) / count;
                 let height = 0.3 * ((i * 0.618_033_988_749_895 + shift).fract() - 0.5);
                 let place = middle + (on_sphere(azimuth, 0.0) * ring + DVec3::Y * height) * half;
-                // Looks outwards or across, in every direction in turn.
+                // The camera looks outwards or across the room, in every direction in turn.
                 let yaw = i * GOLDEN + shift;
                 let pitch = low + (i * 0.754_877_666_246_693 + shift).fract() * (high - low);
                 (place, place + on_sphere(yaw, pitch) * half.length())
@@ -292,7 +293,7 @@ impl Rig {
     }
 }
 
-/// True if a point is inside a solid: most surfaces that it sees show their backs.
+/// True if a point is inside a solid: most surfaces seen from it show their backs.
 fn is_inside(surface: &Surface, place: DVec3) -> bool {
     const RAYS: i32 = 26;
     let (mut fronts, mut backs) = (0, 0);

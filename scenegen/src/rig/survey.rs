@@ -8,16 +8,16 @@ use super::{ATTEMPTS, GOLDEN, Rig, Viewpoint, on_sphere};
 use crate::camera::Camera;
 use crate::surface::Surface;
 
-/// Range of angles below the horizon of the views from above `[degrees]`.
-const DOWN: [f64; 2] = [45.0, 65.0];
-/// Range of angles above the horizon of the street views `[degrees]`.
+/// Smallest and largest angle below the horizon of views from above `[degrees]`.
+const DOWNWARD_ANGLES: [f64; 2] = [45.0, 65.0];
+/// Smallest and largest angle above the horizon of street views `[degrees]`.
 const STREET_PITCH: [f64; 2] = [-4.0, 10.0];
-/// Distance of street views from the street's centre line, alternating sides `[share of eye height]`.
+/// Distance of street views from the street's centre line, on alternating sides `[share of eye height]`.
 const ASIDE: f64 = 0.35;
-/// One of this many views is a street view.
-const STREET: u32 = 3;
-/// Share of a view that must show a surface.
-const SHOWN: f64 = 0.65;
+/// One view in this many is a street view.
+const STREET_INTERVAL: u32 = 3;
+/// Smallest share of a view that must show a surface.
+const MIN_SHOWN: f64 = 0.65;
 /// Columns and rows of the rays by which this share is measured.
 const RAYS: [u32; 2] = [12, 9];
 /// Fractional part of the golden ratio. The fractional parts of its multiples are spread evenly over `[0, 1)`.
@@ -28,7 +28,7 @@ const SPREAD: f64 = 0.618_033_988_749_895;
 pub struct Survey {
     /// Opposite corners, (x, z), of the rectangle that is flown over and looked at.
     pub ground: [[f64; 2]; 2],
-    /// Height of the points looked at, and height of the cameras above it.
+    /// Height of the points looked at, and height of the cameras above these points.
     pub height: [f64; 2],
     /// Both ends of every street, at eye height.
     pub streets: Vec<[[f64; 3]; 2]>,
@@ -47,7 +47,7 @@ impl Survey {
 
     /// Number of views from above among `views`; the others are street views.
     fn above(&self, views: u32) -> u32 {
-        if self.streets.is_empty() { views } else { views - views / STREET }
+        if self.streets.is_empty() { views } else { views - views / STREET_INTERVAL }
     }
 
     /// Total length of all streets.
@@ -72,7 +72,7 @@ impl Survey {
 }
 
 impl Rig {
-    /// The viewpoint of a view of a survey, looking to another side at each attempt.
+    /// The viewpoint of a view of a survey, looking in a different direction at each attempt.
     pub(super) fn survey_viewpoint(
         &self,
         surface: &Surface,
@@ -109,7 +109,7 @@ impl Rig {
         }
     }
 
-    /// The viewpoint above position `i` of `count` in a grid, or for test views halfway to the next position.
+    /// The viewpoint above position `i` of `count` in a grid; for test views, half a cell nearer to the centre.
     fn above_ground(
         &self,
         survey: &Survey,
@@ -121,28 +121,28 @@ impl Rig {
         let middle = 0.5 * (lo + hi);
         let mut place = lo + place;
         if test {
-            // Towards the centre, as there may be nothing to see farther out.
+            // Towards the centre, because there may be nothing to see farther out.
             place -= 0.5 * cell * (place - middle + 1e-9 * cell).signum();
         }
-        let [low, high] = DOWN.map(f64::to_radians);
+        let [low, high] = DOWNWARD_ANGLES.map(f64::to_radians);
         let height = survey.height[1] * self.radius;
         let down = low + (turn * SPREAD).fract() * (high - low);
         let reach = height / down.tan();
-        let mut way = reach * DVec2::from(turn_to(turn * GOLDEN));
+        let mut offset = reach * DVec2::from(horizontal(turn * GOLDEN));
         // Views from the edge look inwards.
         for axis in 0..2 {
-            if !(lo[axis]..=hi[axis]).contains(&(place[axis] + way[axis])) {
-                way[axis] = way[axis].abs() * (middle[axis] - place[axis]).signum();
+            if !(lo[axis]..=hi[axis]).contains(&(place[axis] + offset[axis])) {
+                offset[axis] = offset[axis].abs() * (middle[axis] - place[axis]).signum();
             }
         }
-        let target = place + way;
+        let target = place + offset;
         let base = survey.height[0];
         (DVec3::new(place.x, base + height, place.y), DVec3::new(target.x, base, target.y))
     }
 }
 
-/// (x, z) of a direction on the ground.
-fn turn_to(azimuth: f64) -> [f64; 2] {
+/// The horizontal unit vector at an azimuth, as (x, z).
+fn horizontal(azimuth: f64) -> [f64; 2] {
     let flat = on_sphere(azimuth, 0.0);
     [flat.x, flat.z]
 }
@@ -178,7 +178,7 @@ pub(super) fn shows_enough(surface: &Surface, camera: &Camera, attempt: u64) -> 
     };
     let met = (0..columns * rows).filter(meets).count();
     let still_required = 1.0 - attempt as f64 / ATTEMPTS as f64;
-    met as f64 >= SHOWN * still_required * f64::from(columns * rows)
+    met as f64 >= MIN_SHOWN * still_required * f64::from(columns * rows)
 }
 
 #[cfg(test)]
@@ -188,7 +188,7 @@ mod tests {
     use crate::rig::RigKind;
 
     #[test]
-    fn positions_in_rows_are_distinct_and_even() {
+    fn positions_in_rows_are_evenly_spread() {
         for (count, sides) in
             [(1, [3.0, 9.0]), (12, [4.0, 3.0]), (17, [50.0, 20.0]), (64, [1.0; 2])]
         {

@@ -8,8 +8,8 @@
 //! precision is then equally accurate for meshes of any size and position, and the absolute tolerances of the tree's
 //! builder (1e-4) are below an ulp of the geometry.
 //!
-//! Boxes passed to the builder exceed their triangles by [`PADDING`], so that rounding in the box tests cannot
-//! miss a triangle that the watertight intersection would hit: there are no cracks.
+//! Boxes passed to the builder exceed their triangles by [`PADDING`], so that a box test, despite rounding, never
+//! misses a triangle that the watertight intersection would hit: there are no cracks.
 
 use glam::{DVec3, Vec3, Vec3A};
 use obvhs::aabb::Aabb;
@@ -142,7 +142,7 @@ impl Surface {
         (self.bounds.1 - self.bounds.0).length()
     }
 
-    /// Memory of tree and triangles `[bytes]`.
+    /// Memory of the tree and the triangles `[bytes]`.
     pub fn bytes(&self) -> usize {
         self.bvh.nodes.len() * size_of::<Bvh2Node>()
             + self.triangles.len() * (size_of::<[Vec3; 3]>() + size_of::<u32>())
@@ -158,7 +158,7 @@ impl Surface {
         all
     }
 
-    /// A vertex of the model as it is traced, that is, rounded in local coordinates.
+    /// The position of a vertex as it is traced, that is, rounded in local coordinates.
     pub(crate) fn traced(&self, corner: DVec3) -> DVec3 {
         self.world_from_local(self.local_from_world(corner).as_vec3().as_dvec3())
     }
@@ -192,7 +192,7 @@ impl Surface {
         self.enter_with_distance(origin, direction, range).map(|(ray, _)| ray)
     }
 
-    /// [`Surface::enter`], and the distance to the box `[local units]`.
+    /// Like [`Surface::enter`], but also returns the distance to the box `[local units]`.
     pub(crate) fn enter_with_distance(
         &self,
         origin: DVec3,
@@ -201,8 +201,8 @@ impl Surface {
     ) -> Option<(LocalRay, f32)> {
         let (o, d) = (self.local_from_world(origin), direction * self.scale);
         let half = 0.5 * (self.bounds.1 - self.bounds.0) * self.scale + DVec3::splat(1.0);
-        // Infinite along axes perpendicular to the ray. A ray exactly in a side of the box then gives NaN and may
-        // miss the box: the geometry is one unit farther in.
+        // The reciprocal is infinite along axes perpendicular to the ray. A ray that lies exactly in a side of the box
+        // then gives NaN and may miss the box. It cannot hit the geometry, which is one unit farther in.
         let inverse = d.recip();
         let (a, b) = ((-half - o) * inverse, (half - o) * inverse);
         let near = a.min(b).max_element().max(0.0);
@@ -213,7 +213,7 @@ impl Surface {
         }
         let distance = near * length;
         let direction = (d * length.recip()).as_vec3();
-        // Slightly more than the exact range; callers compare again in f64.
+        // This is slightly more than the exact range; callers compare again in f64.
         let tmax = ((far * length - distance) * (1.0 + 1e-6)) as f32;
         let origin = (o + near * d).as_vec3();
         Some((LocalRay { origin, direction, tmin: 0.0, tmax }, distance as f32))
@@ -241,9 +241,9 @@ impl Surface {
         }
     }
 
-    /// The first accepted hit; of several at the same parameter, that of the model's first triangle. With
-    /// `after` (parameter and triangle), the first one that follows in this order. The triangle in slot `hint`
-    /// is tested first.
+    /// The first accepted hit along a ray; of several at the same ray parameter, that of the triangle with the lowest
+    /// index in the model. With `after` (ray parameter and triangle), the first hit after that one in this order. The
+    /// triangle in slot `hint` is tested first.
     #[inline]
     pub(crate) fn closest(
         &self,
@@ -327,7 +327,7 @@ impl Surface {
         ray.intersect(&self.triangles[slot as usize]).filter(|at| at.t > tmin && at.t <= tmax)
     }
 
-    /// The slot of any triangle with an accepted intersection.
+    /// The slot of any triangle with which the ray has an accepted intersection.
     #[inline]
     pub(crate) fn occluder(
         &self,
@@ -352,16 +352,17 @@ impl Surface {
         let is_hit = |slot: &u32| {
             self.intersect(*slot, &sheared, ray.tmin, ray.tmax).is_some_and(|at| accept(*slot, &at))
         };
-        let mut found = None;
+        let mut occluder = None;
         let visit = |node: &Bvh2Node, _: &mut Ray, _: &mut RayHit| {
-            found = (node.first_index..node.first_index + node.prim_count).find(is_hit);
-            found.is_none()
+            occluder = (node.first_index..node.first_index + node.prim_count).find(is_hit);
+            occluder.is_none()
         };
         self.bvh.ray_traverse_dynamic(&mut stack, box_ray(ray), &mut RayHit::none(), visit);
-        found
+        occluder
     }
 }
 
+/// The ray in obvhs's type, for box tests.
 #[inline]
 fn box_ray(ray: &LocalRay) -> Ray {
     Ray::new(Vec3A::from(ray.origin), Vec3A::from(ray.direction), 0.0, ray.tmax)

@@ -104,7 +104,7 @@ fn the_closest_hit_agrees_with_brute_force() {
         for ray in rays(&surface, 4000, seed + 100) {
             let expected = brute_force(&surface, &ray);
             assert_eq!(surface.occluder(&ray, |_, _| true).is_some(), expected.is_some());
-            // With any hint.
+            // The hint does not change the hit.
             for hint in [None, Some(0), Some(surface.triangles.len() as u32 / 2)] {
                 let found = closest(&surface, &ray, hint);
                 assert_eq!(found, expected, "{count} triangles, {ray:?}");
@@ -179,7 +179,7 @@ fn trees_of_any_depth_are_traversed() {
     for (triangles, expected) in [(chain, 40), (same, 0)] {
         let surface = Surface::new(&model(&triangles)).expect("triangles");
         for stack in [surface.depth, SHALLOW + 1] {
-            // With a traversal stack on the stack and on the heap.
+            // The traversal uses a stack that is not on the heap, then one on the heap.
             let built = Surface::new(&model(&triangles)).expect("triangles");
             let surface = Surface { depth: stack.max(built.depth), ..built };
             let target = triangles[expected];

@@ -32,7 +32,7 @@ pub struct Frame {
     pub height: u32,
     /// sRGB colour and straight alpha (coverage). Shape: `[height, width, 4]`.
     pub rgba: Vec<u8>,
-    /// The photograph, if it differs from `rgba` by its exposure or by passers-by. Same shape.
+    /// The photograph, if it differs from `rgba` by its exposure or by passers-by. Shape: `[height, width, 4]`.
     pub exposed: Option<Vec<u8>>,
     /// 0 where [passers-by](crate::Options::passers_by) cover the scene, 255 elsewhere; `None` for views without
     /// passers-by. Shape: `[height, width]`.
@@ -127,7 +127,7 @@ impl Frame {
 }
 
 impl Tracer<'_> {
-    /// Renders a view, whose index seeds the random numbers. With `gains`, also renders the exposed photograph
+    /// Renders a view; its index `view` seeds the random numbers. With `gains`, also renders the exposed photograph,
     /// with these factors on the channels.
     pub(crate) fn render(&self, camera: &Camera, view: u64, gains: Option<[f32; 3]>) -> Frame {
         let mut frame = Frame::empty(camera.width, camera.height);
@@ -151,7 +151,7 @@ impl Tracer<'_> {
             let rows = depth.len() / width;
             for left in (0..width).step_by(TILE) {
                 let tile = (left, top, TILE.min(width - left), rows);
-                // With a lens the sides of a tile are not planes.
+                // With a lens, the rays through a tile's edges do not lie in planes.
                 if camera.lens.is_none() && self.is_empty(camera, tile) {
                     continue;
                 }
@@ -234,12 +234,12 @@ impl Tracer<'_> {
         (straight, alpha / (grid * grid) as f32, sampling.hit_hint)
     }
 
-    /// Sums over rays of premultiplied colour and alpha.
+    /// Sums of premultiplied colour and alpha over the rays.
     fn sum_rays(&self, rays: &Rays, sampling: &mut Sampling) -> (Vec3, f32) {
         let shaded = self.shaded();
         let visible = |slot, at: &Intersection| shaded.is_visible(slot, at);
         let (mut colours, mut alphas) = (Vec3::ZERO, 0.0);
-        // One packet for the first surfaces, as most are opaque; single rays for those behind them.
+        // The first surfaces are found with one packet, as most are opaque; those behind them with single rays.
         let hits = self.surface.closest_each(rays.all(), visible);
         sampling.hit_hint = hits[rays.count / 2].map(|hit| hit.slot).or(sampling.hit_hint);
         let mut alphas_of = [0.0; LANES];
@@ -326,7 +326,7 @@ fn encoded(light: Vec3, coverage: f32) -> [u8; 4] {
     [encode(light.x), encode(light.y), encode(light.z), a]
 }
 
-/// Luminances on a grid over a view, one ray every `step` pixels, for choosing an exposure.
+/// Luminances of a view, from one ray every `step` pixels in both directions, for choosing an exposure.
 pub(crate) fn luminances(tracer: &Tracer<'_>, camera: &Camera, step: u32) -> Vec<f32> {
     let mut all = Vec::new();
     for y in (0..camera.height).step_by(step as usize) {

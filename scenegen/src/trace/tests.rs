@@ -13,7 +13,7 @@ use crate::shade::Ambient;
 use crate::sky::Sky;
 use crate::{Options, Scene, Source};
 
-/// A rendering of a model by a camera.
+/// Renders a model as seen by a camera.
 fn render(model: &Model, camera: &Camera, sky: Sky, ambient: Ambient) -> Frame {
     let surface = Surface::new(model).expect("triangles");
     let flags = TriangleFlags::all(&surface, model);
@@ -179,7 +179,7 @@ fn only_occluders_cast_shadows() {
     let sky = || Sky::uniform(0.1);
     let lit = render(&model, &camera, sky(), Ambient::Open).rgba[0];
     assert_eq!(lit, encode(1.1));
-    // With a lid above.
+    // A lid above the floor casts a shadow.
     let lid = model.material(Material::default());
     model.quad(DVec3::new(-1.0, 1.0, -1.0), 2.0 * DVec3::X, 2.0 * DVec3::Z, lid);
     assert_eq!(render(&model, &camera, sky(), Ambient::Open).rgba[0], encode(0.1));
@@ -267,7 +267,7 @@ fn cameras_are_outside_of_solids() {
 }
 
 #[test]
-fn image_skies_agree_with_gradients_and_sampling_with_the_closed_form() {
+fn image_skies_agree_with_gradients_and_sampling_agrees_with_the_closed_form() {
     let mut model = floor(Material::lambert("grey", [0.5; 3]));
     let shiny = Material {
         reflection: Reflection::MetalRough,

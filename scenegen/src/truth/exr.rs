@@ -11,7 +11,7 @@ use super::REMEDY;
 use crate::error::Error;
 use crate::resource::EXPANSION;
 
-/// The channels of the image, in the given order; `None` if it has a different size.
+/// Reads the channels of an image, in the given order; `None` if the image has a different size.
 pub(super) fn read<const N: usize>(
     path: &Path,
     channels: [&str; N],
@@ -36,7 +36,7 @@ pub(super) fn read<const N: usize>(
     if (header.layer_size.0, header.layer_size.1) != size {
         return Ok(None);
     }
-    // The camera bounds the size, but the file must also be large enough for it.
+    // The camera bounds the image's size, but the file must also be large enough to hold such an image.
     let needed = u64::from(width) * u64::from(height) * 4 * N as u64;
     if needed > (bytes.len() as u64).saturating_mul(EXPANSION) {
         return Err(bad("header", format!("{width}x{height} px cannot be in so small a file")));

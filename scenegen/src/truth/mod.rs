@@ -26,7 +26,7 @@ const LONGEST_RECORD: u64 = 1 << 24;
 const SAME_DEPTH: f64 = 1e-5;
 /// The remedy for damaged files.
 const REMEDY: &str = "write the scene again with densify scenegen --overwrite";
-/// Offset into the surface for measuring its thickness, as a share of the diagonal.
+/// Offset below the surface at which measuring a thickness starts, as a share of the diagonal.
 const STEP: f64 = 1e-7;
 
 /// The geometry that a scene was rendered from.
@@ -93,7 +93,7 @@ impl GroundTruth {
 
     /// Depth and normals seen by `camera`. In a folder, `view` (the view's name in a dataset) selects the files
     /// to read. If they are missing or have a different size, the mesh is traced instead, which also includes
-    /// surfaces with alpha below one half.
+    /// surfaces with an alpha below one half.
     ///
     /// # Errors
     /// When a file is damaged.
@@ -104,7 +104,7 @@ impl GroundTruth {
                 Some((depth, normal))
             })),
             Kind::Folder { root, surface, has_lens, .. } => {
-                // Stored images seen through a lens do not fit this camera, which has none.
+                // Images stored for a camera with a lens do not fit this camera, which has none.
                 let is_distorted = *has_lens && view.contains("train/");
                 let size = (camera.width, camera.height);
                 if let Some(stored) =

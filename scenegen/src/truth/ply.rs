@@ -14,8 +14,8 @@ const HEADER: usize = 4096;
 /// Size of a corner `[bytes]`.
 const CORNER: usize = 24;
 
-/// Corners, three per triangle, and flags that mark thin triangles (files of earlier versions have neither flags
-/// nor thin triangles).
+/// Reads the corners, three per triangle, and the flags that mark thin triangles (files of earlier versions have
+/// neither flags nor thin triangles).
 pub(super) fn read(path: &Path) -> Result<(Vec<DVec3>, Vec<bool>), Error> {
     let bytes = fs::read(path).map_err(Error::io(path))?;
     let bad = |element: &str, problem: &str| Error::malformed(path, element, problem, REMEDY);

@@ -77,7 +77,7 @@ fn wires_have_their_true_thickness() {
     let depth = truth.surface().cast(above, DVec3::NEG_Y, 10.0).expect("an end").t;
     let thickness = truth.thickness(above, DVec3::NEG_Y, depth).expect("thin");
     assert!((0.02..=0.025).contains(&thickness), "{thickness}");
-    // Something else is in front.
+    // At another depth, the wire is not what the ray hits first.
     assert!(truth.thickness(from, DVec3::NEG_Z, depth + 0.1).is_none());
 }
 
@@ -91,10 +91,10 @@ fn damaged_files_are_refused_without_panics() {
     let mesh = target.join("mesh.ply");
     let whole = fs::read(&mesh).expect("mesh");
     let header = whole.windows(11).position(|w| w == b"end_header\n").expect("an end") + 11;
-    let refused = |bytes: &[u8], what: &str| {
+    let refused = |bytes: &[u8], case: &str| {
         fs::write(&mesh, bytes).expect("write");
-        let error = GroundTruth::open(&target).err().unwrap_or_else(|| panic!("{what}: accepted"));
-        assert!(error.to_string().contains("mesh.ply"), "{what}: {error}");
+        let error = GroundTruth::open(&target).err().unwrap_or_else(|| panic!("{case}: accepted"));
+        assert!(error.to_string().contains("mesh.ply"), "{case}: {error}");
     };
     for length in [0, 3, 40, header - 1, header, header + 1, whole.len() - 1] {
         refused(&whole[..length], &format!("{length} bytes"));
@@ -119,7 +119,7 @@ fn damaged_files_are_refused_without_panics() {
         let message = error.unwrap_or_else(|| panic!("{length} bytes accepted")).to_string();
         assert!(message.contains("r_000.exr"), "{message}");
     }
-    // With any wrong byte the values are wrong or refused, but nothing panics.
+    // A wrong byte gives wrong values or an error, but never a panic.
     for at in 0..whole.len().min(600) {
         for flip in [0x01, 0x80, 0xff] {
             let mut bytes = whole.clone();

@@ -1,7 +1,7 @@
 //! Writes COLMAP's text model under `sparse/0`; image names are relative to `images`.
 //!
 //! Features are the exact projections of true surface points; only the 3D points have noise or are outliers.
-//! Reprojection errors therefore come from these alone.
+//! Reprojection errors therefore come from the 3D points alone.
 
 use std::fmt::Write as _;
 use std::path::Path;
@@ -20,7 +20,7 @@ pub(super) fn write(scene: &Scene, root: &Path, points: &InitPoints) -> Result<(
     let mut images = String::from(
         "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n# POINTS2D[] as (X, Y, POINT3D_ID)\n",
     );
-    // The points that each view sees; and each point's track: its views, with the feature's index in each.
+    // The points that each view sees; and each point's track: the views that see it, with its feature's index in each.
     let mut seen: Vec<Vec<usize>> = vec![Vec::new(); scene.views.len()];
     let mut tracks: Vec<Vec<(usize, usize)>> = vec![Vec::new(); points.positions.len()];
     for (point, views) in points.seen_by.iter().enumerate() {

@@ -65,7 +65,7 @@ pub fn write(
         progress(number);
     }
     let points = collector.finish();
-    write_rest(scene, root, &points)?;
+    write_other_files(scene, root, &points)?;
     make_readable(root)?;
     if replaces {
         let old = folder_beside(".densify-old-")?;
@@ -85,22 +85,22 @@ pub fn write(
         }
         fs::rename(folder.path(), target).map_err(Error::write(target))?;
     }
-    // Prevents the deletion of the temporary folder, which has been renamed.
+    // The temporary folder has been renamed, so it must not be deleted.
     let _ = folder.keep();
     Ok(Written { views: scene.views.len(), points: points.positions.len() })
 }
 
-/// True if the target holds an earlier scene. An error if it must not be overwritten, or if the target holds
-/// anything else.
+/// True if the target holds an earlier scene; false if it is empty or missing. An error if the scene must not be
+/// overwritten, or if the target holds anything else.
 fn holds_scene(target: &Path, overwrite: bool) -> Result<bool, Error> {
     let refuse =
-        |what: &str| Err(Error::option("--output", format!("{} {what}", target.display())));
-    let taken = match fs::read_dir(target) {
+        |problem: &str| Err(Error::option("--output", format!("{} {problem}", target.display())));
+    let holds_files = match fs::read_dir(target) {
         Ok(mut entries) => entries.next().is_some(),
         Err(error) if error.kind() == std::io::ErrorKind::NotFound => false,
         Err(error) => return Err(Error::write(target)(error)),
     };
-    if !taken {
+    if !holds_files {
         return Ok(false);
     }
     match (target.join(record::NAME).is_file(), overwrite) {
@@ -113,12 +113,12 @@ fn holds_scene(target: &Path, overwrite: bool) -> Result<bool, Error> {
 /// Checks before rendering that [`write()`] can use a folder.
 ///
 /// # Errors
-/// As [`write()`].
+/// When the folder holds a scene and `overwrite` is false, or holds anything else.
 pub fn check_target(target: &Path, overwrite: bool) -> Result<(), Error> {
     holds_scene(target, overwrite).map(|_| ())
 }
 
-/// Gives the folder the permissions of its subfolders, as temporary folders are accessible to their owner only.
+/// Gives the folder the permissions of its subfolders, as only their owner can access temporary folders.
 fn make_readable(folder: &Path) -> Result<(), Error> {
     #[cfg(unix)]
     {
@@ -153,7 +153,7 @@ fn mask_path(name: &str) -> String {
     format!("masks/{name}.png")
 }
 
-fn write_rest(scene: &Scene, root: &Path, points: &InitPoints) -> Result<(), Error> {
+fn write_other_files(scene: &Scene, root: &Path, points: &InitPoints) -> Result<(), Error> {
     transforms::write(scene, root)?;
     colmap::write(scene, root, points)?;
     ply::write_points(&root.join("points3d.ply"), points)?;
@@ -182,7 +182,7 @@ fn write_file(path: &Path, bytes: &[u8]) -> Result<(), Error> {
     fs::write(path, bytes).map_err(Error::write(path))
 }
 
-/// One image of eight evenly spaced training views over light grey: width, height and RGBA pixels.
+/// Renders eight evenly spaced training views over light grey into one image: width, height and RGBA pixels.
 pub fn contact_sheet(scene: &Scene) -> (u32, u32, Vec<u8>) {
     const COLUMNS: usize = 4;
     const GREY: f32 = 224.0;

@@ -1,6 +1,6 @@
 //! Writes depth as a NumPy array for nerfstudio, in its default unit: thousandths of a world unit.
 //!
-//! The 16-bit PNG that nerfstudio also reads has too low a precision or range, except for scenes of a few
+//! The 16-bit PNG that nerfstudio also reads has too little precision or range, except for scenes of a few
 //! metres. Format: numpy.org/doc/stable/reference/generated/numpy.lib.format.html
 
 use std::path::Path;
@@ -9,7 +9,7 @@ use super::write_file;
 use crate::error::Error;
 use crate::trace::Frame;
 
-/// Depth `[world units / 1000]`, 0 where there is no surface. Shape: `[height, width]`.
+/// Writes depth `[world units / 1000]`, 0 where there is no surface. Shape: `[height, width]`.
 pub(super) fn write_depth(path: &Path, frame: &Frame) -> Result<(), Error> {
     // Size of magic, version and length.
     const PREFIX: usize = 10;

@@ -31,7 +31,7 @@ pub(super) fn write_points(path: &Path, points: &InitPoints) -> Result<(), Error
     write_file(path, &bytes)
 }
 
-/// The header of a mesh of `faces` triangles, with or without flags of thin ones.
+/// The header of a mesh of `faces` triangles, with or without flags that mark thin ones.
 pub(crate) fn mesh_header(faces: u32, has_flags: bool) -> String {
     let vertices = 3 * u64::from(faces);
     let thin = if has_flags { "property uchar thin\n" } else { "" };
@@ -43,10 +43,10 @@ pub(crate) fn mesh_header(faces: u32, has_flags: bool) -> String {
 }
 
 /// Writes the triangles as traced, in world coordinates, each with its own corners and a flag for thin
-/// structures. Corners are f64, which meshes far from the origin need. Streams, because the file is larger than
-/// the mesh in memory.
+/// structures. Corners are f64, which meshes far from the origin need. The file is streamed, because it is larger
+/// than the mesh in memory.
 pub(super) fn write_mesh(path: &Path, scene: &Scene) -> Result<(), Error> {
-    // Indices of corners have 32 bits.
+    // Indices in the model and in the file have 32 bits.
     let count = scene.model.triangles.len() as u32;
     let write = || -> std::io::Result<()> {
         let mut out = BufWriter::new(File::create(path)?);

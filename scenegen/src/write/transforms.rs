@@ -27,7 +27,7 @@ pub(super) fn write(scene: &Scene, root: &Path) -> Result<(), Error> {
     Ok(())
 }
 
-/// The views of a split, with the intrinsics `first` at the top; a view lists those of its own that differ.
+/// The views of a split, with the intrinsics `first` at the top; each view lists only the intrinsics that differ.
 fn synthetic(scene: &Scene, first: &Value, split: Split) -> Value {
     let frame = |view: &View| {
         let mut frame = frame_with_pose(view, format!("./images/{}", view.name));
@@ -63,7 +63,7 @@ fn nerfstudio(scene: &Scene, first: &Value) -> Value {
     let files = |split: Split| -> Value {
         scene.views.iter().filter(|view| view.split == split).map(image).collect()
     };
-    // Without test views nerfstudio chooses some itself; an empty list would be an error.
+    // Without these lists, nerfstudio chooses test views itself; an empty list would be an error.
     if scene.views.iter().any(|view| view.split == Split::Test) {
         for (key, split) in [("train", Split::Train), ("val", Split::Test), ("test", Split::Test)] {
             top[format!("{key}_filenames")] = files(split);
@@ -76,7 +76,7 @@ fn frame_with_pose(view: &View, file: String) -> Value {
     json!({ "file_path": file, "transform_matrix": world_from_opengl(&view.camera) })
 }
 
-/// Copies the fields that are `wanted`.
+/// Copies the fields for which `wanted` is true.
 fn extend(to: &mut Value, from: &Value, wanted: impl Fn(&str, &Value) -> bool) {
     for (key, value) in from.as_object().into_iter().flatten() {
         if wanted(key, value) {

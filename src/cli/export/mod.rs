@@ -64,7 +64,7 @@ fn after_help() -> String {
         let _ = writeln!(text, "  {name:14}  .{extension:14}  {summary}");
     }
     text + "
-Options under Scene are for a file with --scene; a run brings its own.
+Options under Scene are for a model file with --scene; a run brings its own.
 
 Examples:
   densify export output/garden-diet -o garden.ply
@@ -194,17 +194,17 @@ pub(super) fn format_from_extension(output: &Path) -> Result<&'static Format, Fa
 
 /// Fails if the output would replace something that it must not.
 pub(super) fn check_output(path: &Path, overwrite: bool) -> Result<(), Failure> {
-    let path_text = path.display();
+    let shown = path.display();
     match path.symlink_metadata() {
         Ok(_) if path.is_dir() => {
-            Err(Failure::input(format!("-o: {path_text} is a folder; name a file")))
+            Err(Failure::input(format!("-o: {shown} is a folder; name a file")))
         }
         // Renaming a file over a device or a pipe would remove it for other programs.
         Ok(_) if path.exists() && !path.is_file() => {
-            Err(Failure::input(format!("-o: {path_text} is a device or a pipe; name a file")))
+            Err(Failure::input(format!("-o: {shown} is a device or a pipe; name a file")))
         }
         Ok(_) if !overwrite => Err(Failure::input(format!(
-            "-o: {path_text} exists; choose another file, or replace it with --overwrite"
+            "-o: {shown} exists; choose another file, or replace it with --overwrite"
         ))),
         _ => Ok(()),
     }

@@ -9,7 +9,7 @@ use densify_data::models::PLY;
 pub(super) struct WrittenFile {
     /// Name of its format.
     pub(super) format: &'static str,
-    /// Its size.
+    /// Its size `[bytes]`.
     pub(super) bytes: u64,
     /// PSNR of its renderings against those of the model `[dB]`; infinite if they are equal.
     pub(super) psnr: Option<f64>,

@@ -26,7 +26,7 @@ use densify_train::output::RunFolder;
 ///
 /// SCENE is a folder with a COLMAP reconstruction (images/ and sparse/0/), a NeRF-synthetic scene
 /// (transforms_train.json and transforms_test.json) or a nerfstudio dataset (transforms.json); or a
-/// built-in scene by name, as scene:spheres (`densify scenegen --list` shows them).
+/// built-in scene by name, such as scene:spheres (`densify scenegen --list` shows them).
 #[derive(Debug, Args)]
 #[command(after_help = EXAMPLES)]
 pub(super) struct TrainArgs {
@@ -45,8 +45,8 @@ pub(super) struct TrainArgs {
     overwrite: bool,
     /// Show the run in the browser while it trains: serves a page on this machine alone, with the model,
     /// curves and edits, and buttons that pause, save and stop the run (default port: the first free one from 8080
-    /// on). From another machine: ssh -L 8080:127.0.0.1:8080 NAME, then the whole printed address. Its pictures are
-    /// no larger than the largest photograph. The page does not change the run, but takes part of --memory
+    /// on). From another machine: ssh -L 8080:127.0.0.1:8080 NAME, then open the whole printed address. The page's
+    /// pictures are no larger than the largest photograph. The page does not change the run, but takes part of --memory
     #[arg(
         long, value_name = "PORT", num_args = 0..=1, require_equals = true, default_missing_value = "0",
         help_heading = "Output"
@@ -109,7 +109,7 @@ pub(super) fn run(
     if occupied != Occupied::Resume {
         RunFolder::check(&spec.output_folder()?, args.overwrite)?;
     }
-    // Bind the port first: a failure shows at once, and a scene may take long to read.
+    // Bind the port first: a failure then shows at once, although a scene may take long to read.
     let page = args.view.map(page::open).transpose()?;
     threads::limit(spec.device.threads);
     let run = Run::prepare_on(&spec, resumed, args.host(&follower))?;
@@ -140,7 +140,7 @@ fn print_preset(spec: &RunSpec, console: &Console) -> Result<(), Failure> {
 /// Shows a run on the console, and stops it on a signal.
 pub(super) struct Follower<'a> {
     console: &'a Console,
-    /// True if details are shown, too.
+    /// True if lines of detail are shown, too.
     verbose: bool,
     progress: RefCell<Option<Progress<'a>>>,
     interrupts: RefCell<Option<Interrupts>>,

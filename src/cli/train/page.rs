@@ -23,7 +23,7 @@ pub(super) fn train(
     follower: &Follower<'_>,
     console: &Console,
 ) -> Result<(), Failure> {
-    // The page is useless without its address, so a quiet run prints it too.
+    // The page is useless without its address, so even a quiet run prints the address.
     console.result(format_args!("page     {}", page.url()));
     page.follow(run, follower, |run, observer| run.train(occupied, observer).map(drop))
 }

@@ -1,4 +1,4 @@
-//! Replaces the live page of a run in a program built without the feature `view`: refuses `--view`.
+//! Replaces the live page of a run if the program was built without the feature `view`: `--view` is refused.
 
 use super::Follower;
 use crate::console::Console;

@@ -11,18 +11,21 @@ use crate::camera::Camera;
 const KEYFRAMES: u32 = 48;
 /// Number of turns of a spiral.
 const TURNS: f64 = 2.0;
-/// Directions count as coplanar if at most this fraction of their squared length is normal to the plane, which allows
-/// a root mean square roll of 13°.
+/// Directions count as coplanar if less than this fraction of the sum of their squared lengths is normal to the plane.
+/// This allows a root mean square roll of 13°.
 const MAX_NORMAL_FRACTION: f64 = 0.05;
-/// Coplanar directions count as collinear if at most this fraction is along their second axis.
+/// Coplanar directions count as collinear if at most this fraction of that sum is along the plane's second axis.
 const MAX_LINE_FRACTION: f64 = 0.1;
-/// The quantile of the cameras' offsets that is the radius of a spiral.
+/// The quantile of the cameras' offsets from their centre that is used as the radius of a spiral.
 const REACH_QUANTILE: f64 = 0.9;
 
 /// Common properties of a set of cameras.
 struct Rig {
+    /// Mean position.
     centre: DVec3,
+    /// Mean viewing direction, unit length.
     forward: DVec3,
+    /// Common up direction, unit length.
     up: DVec3,
     /// The point nearest to all lines of sight.
     focus: DVec3,
@@ -33,7 +36,7 @@ struct Rig {
 }
 
 impl Rig {
-    /// Computes the properties of cameras, of which there must be at least one.
+    /// Computes the properties of at least one camera.
     fn new(cameras: &[Camera]) -> Self {
         let mean = |vector: &dyn Fn(&Camera) -> DVec3| {
             cameras.iter().map(vector).sum::<DVec3>() / cameras.len() as f64
@@ -41,8 +44,8 @@ impl Rig {
         let centre = mean(&Camera::centre);
         let forward = mean(&Camera::forward).normalize_or(cameras[0].forward());
         let up = mean(&|camera| -camera.rotation.row(1)).normalize_or(-cameras[0].rotation.row(1));
-        // Least squares: Σ (I − ffᵀ) (x − c) = 0. A small weight on the mean position keeps the system
-        // solvable when all cameras look the same way.
+        // The point x nearest to all lines of sight (camera centre c, direction f) solves Σ (I − ffᵀ)(x − c) = 0. A
+        // small weight on the mean position keeps the system solvable when all cameras look the same way.
         let (mut matrix, mut rhs) = (DMat3::IDENTITY * 1e-9, centre * 1e-9);
         for camera in cameras {
             let f = camera.forward();
@@ -57,9 +60,9 @@ impl Rig {
         let level =
             [0, 1].map(|axis| plane_normal(cameras.iter().map(move |c| c.rotation.row(axis))));
         let up = level[0].or(level[1]).map_or(up, |normal| {
-            // With the camera on its side the sign is unknown; cameras are mostly above their subject.
-            let sign = if level[0].is_some() { up } else { centre - focus };
-            if normal.dot(sign) < 0.0 { -normal } else { normal }
+            // The axes of a camera on its side do not show which way is up, but cameras are mostly above their subject.
+            let roughly_up = if level[0].is_some() { up } else { centre - focus };
+            if normal.dot(roughly_up) < 0.0 { -normal } else { normal }
         });
         let mut fovs: Vec<f64> = cameras
             .iter()
@@ -101,19 +104,19 @@ fn outer(d: DVec3) -> DMat3 {
 fn plane_normal(directions: impl Iterator<Item = DVec3> + Clone) -> Option<DVec3> {
     let scatter = directions.map(outer).fold(DMat3::ZERO, |sum, part| sum + part);
     let total = scatter.x_axis.x + scatter.y_axis.y + scatter.z_axis.z;
-    // Power iteration finds the longest axis of a matrix, and the shortest one with its inverse.
+    // Power iteration finds a matrix's longest axis; with the inverse matrix, it finds the shortest.
     let axis = |matrix: DMat3| {
         (0..64).try_fold(DVec3::new(0.36, 0.48, 0.8), |axis, _| (matrix * axis).try_normalize())
     };
     let along = |axis: DVec3| axis.dot(scatter * axis) / total;
     let normal = axis((scatter + DMat3::IDENTITY * (1e-9 * total)).inverse())?;
     let longest = axis(scatter)?;
-    let across = 1.0 - along(normal) - along(longest);
-    (along(normal) < MAX_NORMAL_FRACTION && across > MAX_LINE_FRACTION).then_some(normal)
+    let second = 1.0 - along(normal) - along(longest);
+    (along(normal) < MAX_NORMAL_FRACTION && second > MAX_LINE_FRACTION).then_some(normal)
 }
 
-/// A circle around the cameras' focus at their mean height and distance. If they look outward, as in a room seen
-/// from its middle, a circle around their centre that looks outward.
+/// A circle around the cameras' focus at their mean height and distance. If the cameras look outward, as in a room seen
+/// from its middle, the path is a circle around their centre and also looks outward.
 ///
 /// # Panics
 /// If there are no cameras.
@@ -140,7 +143,7 @@ pub fn orbit(cameras: &[Camera]) -> CameraPath {
 }
 
 /// A spiral of two turns around the centre of the cameras, looking at their focus. Its radii are the 90 % quantiles of
-/// their offsets from the centre (*Local Light Field Fusion*, Mildenhall et al. 2019).
+/// the cameras' offsets from the centre (*Local Light Field Fusion*, Mildenhall et al. 2019).
 ///
 /// # Panics
 /// If there are no cameras.
@@ -148,27 +151,24 @@ pub fn spiral(cameras: &[Camera]) -> CameraPath {
     let rig = Rig::new(cameras);
     let right = rig.forward.cross(rig.up).normalize_or(rig.forward.any_orthonormal_vector());
     let down = rig.forward.cross(right);
-    let reach = |axis: DVec3| {
+    let radius_along = |axis: DVec3| {
         let mut along: Vec<f64> =
             cameras.iter().map(|camera| (camera.centre() - rig.centre).dot(axis).abs()).collect();
         along.sort_by(f64::total_cmp);
         along[((along.len() - 1) as f64 * REACH_QUANTILE).round() as usize]
     };
-    let reaches = [right, down, rig.forward].map(reach);
+    let radii = [right, down, rig.forward].map(radius_along);
     let distance = (rig.focus - rig.centre).dot(rig.forward);
-    // If the focus is not ahead of the cameras, the path looks at a point well beyond them.
-    let distance = if distance > reaches[2] {
-        distance
-    } else {
-        4.0 * reaches.into_iter().fold(0.25, f64::max)
-    };
+    // If the focus is not ahead of the cameras, the path looks at a point well in front of them.
+    let distance =
+        if distance > radii[2] { distance } else { 4.0 * radii.into_iter().fold(0.25, f64::max) };
     let target = rig.centre + rig.forward * distance;
     let keyframe = |i: u32| {
         let angle = TAU * TURNS * f64::from(i) / f64::from(KEYFRAMES);
         let centre = rig.centre
-            + right * (reaches[0] * angle.cos())
-            + down * (reaches[1] * angle.sin())
-            + rig.forward * (reaches[2] * (0.5 * angle).sin());
+            + right * (radii[0] * angle.cos())
+            + down * (radii[1] * angle.sin())
+            + rig.forward * (radii[2] * (0.5 * angle).sin());
         Keyframe::looking_at(centre, target, rig.up, rig.fov_y)
     };
     CameraPath { keyframes: (0..KEYFRAMES).map(keyframe).collect(), is_loop: true }

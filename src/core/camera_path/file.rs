@@ -13,8 +13,8 @@ use crate::files;
 const MAX_BYTES: u64 = 64 << 20;
 /// Maximum number of keyframes of a path, and maximum number of frames.
 const MAX_KEYFRAMES: usize = 100_000;
-/// The size of frames if the file gives none `[px]`; only the poses and the aspect ratio matter then.
-const ANY_SIZE: (u32, u32) = (1600, 900);
+/// Width and height of frames if the file gives none `[px]`; only the poses and the aspect ratio matter then.
+const DEFAULT_SIZE: (u32, u32) = (1600, 900);
 /// Maximum width and height of a frame `[px]`.
 pub const MAX_SIDE: u32 = 16_384;
 
@@ -26,7 +26,7 @@ pub enum CameraPathError {
     Read {
         /// The file.
         path: PathBuf,
-        /// The error of the system.
+        /// The cause.
         source: std::io::Error,
     },
     /// The file is not a camera path that densify can use.
@@ -44,7 +44,7 @@ pub enum CameraPathError {
 pub struct SavedCameraPath {
     /// The path, in the coordinates of the dataset.
     pub path: CameraPath,
-    /// Number of frames, >= 1: duration times rate, or one per keyframe.
+    /// Number of frames, >= 1: duration times frame rate if the file has both, otherwise one per keyframe.
     pub frames: u32,
     /// Frames per second, 1 to 1000, if given.
     pub fps: Option<u32>,
@@ -55,7 +55,7 @@ pub struct SavedCameraPath {
 impl SavedCameraPath {
     /// The cameras of all frames, with images of the path's size, or of an arbitrary size if it has none.
     pub fn cameras(&self) -> Vec<Camera> {
-        let size = self.size.unwrap_or(ANY_SIZE);
+        let size = self.size.unwrap_or(DEFAULT_SIZE);
         (0..self.frames).map(|frame| self.path.frame(frame, self.frames).camera(size)).collect()
     }
 }
@@ -100,17 +100,17 @@ pub(super) fn parse(text: &str) -> Result<SavedCameraPath, String> {
     }
     let count = saved.camera_path.len();
     if count == 0 || count > MAX_KEYFRAMES {
-        return Err(format!("camera_path has {count} cameras; 1 to {MAX_KEYFRAMES} are possible"));
+        return Err(format!("camera_path has {count} cameras; it must have 1 to {MAX_KEYFRAMES}"));
     }
-    let keyframes = saved.camera_path.iter().enumerate().map(|(at, saved)| {
+    let keyframes = saved.camera_path.iter().enumerate().map(|(index, saved)| {
         parse_keyframe(&saved.camera_to_world, saved.fov)
-            .map_err(|problem| format!("camera {at} of camera_path: {problem}"))
+            .map_err(|problem| format!("camera {index} of camera_path: {problem}"))
     });
     let keyframes = keyframes.collect::<Result<_, String>>()?;
     let path = CameraPath { keyframes, is_loop: saved.is_cycle };
-    let bounded = |name: &str, value: Option<f64>, most: f64| match value {
-        Some(value) if !(value > 0.0 && value <= most) => {
-            Err(format!("{name} is {value}; it must be above 0 and at most {most}"))
+    let bounded = |name: &str, value: Option<f64>, max: f64| match value {
+        Some(value) if !(value > 0.0 && value <= max) => {
+            Err(format!("{name} is {value}; it must be above 0 and at most {max}"))
         }
         value => Ok(value),
     };

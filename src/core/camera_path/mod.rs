@@ -10,7 +10,7 @@ use crate::spline::catmull_rom;
 pub use around::{Orientation, orbit, orientation, spiral};
 pub use file::{CameraPathError, MAX_SIDE, SavedCameraPath, parse_keyframe, read};
 
-/// A camera that a path passes.
+/// A camera that a path passes through.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Keyframe {
     /// Position in the world.
@@ -24,7 +24,7 @@ pub struct Keyframe {
 /// A smooth path through keyframes.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CameraPath {
-    /// The keyframes, at equal intervals; at least one.
+    /// The keyframes, at equal intervals of time; at least one.
     pub keyframes: Vec<Keyframe>,
     /// True if the path returns from the last keyframe to the first.
     pub is_loop: bool,
@@ -48,9 +48,9 @@ impl Keyframe {
 }
 
 impl CameraPath {
-    /// Interpolates the camera of frame `frame` of `frames`. A loop's last frame is one step before its first;
-    /// any other path ends at its last keyframe. Positions, rotations and fields of view follow a Catmull-Rom spline,
-    /// so that speed is continuous.
+    /// Interpolates the camera of frame `frame`, counted from 0, of `frames`. A loop's last frame is one step before
+    /// its first; any other path ends at its last keyframe. Positions, rotations and fields of view follow a
+    /// Catmull-Rom spline, so that speed is continuous.
     pub fn frame(&self, frame: u32, frames: u32) -> Keyframe {
         let count = self.keyframes.len();
         let (steps, intervals) =
@@ -63,12 +63,12 @@ impl CameraPath {
             let index = if self.is_loop { at.rem_euclid(count) } else { at.clamp(0, count - 1) };
             self.keyframes[index as usize]
         };
-        let near = [keyframe(-1), keyframe(0), keyframe(1), keyframe(2)];
+        let nearest = [keyframe(-1), keyframe(0), keyframe(1), keyframe(2)];
         let weights = catmull_rom(t);
         let mut rotation = DQuat::from_xyzw(0.0, 0.0, 0.0, 0.0);
         let (mut centre, mut log_fov) = (DVec3::ZERO, 0.0);
-        let reference = near[1].world_from_camera;
-        for (keyframe, weight) in near.iter().zip(weights) {
+        let reference = nearest[1].world_from_camera;
+        for (keyframe, weight) in nearest.iter().zip(weights) {
             centre += keyframe.centre * weight;
             log_fov += (0.5 * keyframe.fov_y).tan().ln() * weight;
             // q and −q are the same rotation.

@@ -76,7 +76,7 @@ fn a_circle_of_cameras_on_their_side_still_gives_the_up_direction() {
 
 #[test]
 fn a_spiral_stays_within_the_cameras_and_looks_ahead() {
-    // A wall of cameras, all looking along y at something 4 away.
+    // A wall of cameras, all looking along y at a point 4 units away.
     let place = |i: u32| DVec3::new(f64::from(i % 5) - 2.0, 0.0, f64::from(i / 5) - 2.0);
     let target = DVec3::new(0.0, 4.0, 0.0);
     let cameras: Vec<Camera> =
@@ -119,13 +119,13 @@ fn a_path_passes_its_keyframes_smoothly() {
     keys[2].world_from_camera = -keys[2].world_from_camera;
     let path = CameraPath { keyframes: keys.clone(), is_loop: false };
     for (at, key) in keys.iter().enumerate() {
-        let found = path.frame(10 * at as u32, 31);
-        assert!(found.centre.distance(key.centre) < 1e-9, "{at}: {found:?}");
+        let frame = path.frame(10 * at as u32, 31);
+        assert!(frame.centre.distance(key.centre) < 1e-9, "{at}: {frame:?}");
         assert!(
-            found.world_from_camera.dot(key.world_from_camera).abs() > 1.0 - 1e-9,
-            "{at}: {found:?}"
+            frame.world_from_camera.dot(key.world_from_camera).abs() > 1.0 - 1e-9,
+            "{at}: {frame:?}"
         );
-        assert!((found.fov_y - key.fov_y).abs() < 1e-9, "{at}: {found:?}");
+        assert!((frame.fov_y - key.fov_y).abs() < 1e-9, "{at}: {frame:?}");
     }
     // Consecutive steps between frames differ little: no stop and no jump at a keyframe.
     let frames: Vec<Keyframe> = (0..301).map(|frame| path.frame(frame, 301)).collect();
@@ -137,7 +137,7 @@ fn a_path_passes_its_keyframes_smoothly() {
         .windows(2)
         .map(|pair| pair[0].world_from_camera.angle_between(pair[1].world_from_camera));
     assert!(turns.into_iter().all(|angle| angle < 0.05));
-    // A loop returns.
+    // A loop returns to its first keyframe.
     let closed = CameraPath { keyframes: keys, is_loop: true };
     assert!(closed.frame(40, 40).centre.distance(closed.frame(0, 40).centre) < 1e-9);
     let single = CameraPath { keyframes: vec![key(1.0, 1.0)], is_loop: false };
@@ -151,14 +151,14 @@ fn nerfstudio_files_are_read() {
         "camera_to_world": [1, 0, 0, 7, 0, 0, -1, 8, 0, 1, 0, 9, 0, 0, 0, 1]}]}"#;
     let SavedCameraPath { path, frames, fps, size } = parse(text).unwrap();
     assert_eq!((path.is_loop, frames, fps, size), (true, 1, Some(24), None));
-    // Duration times rate.
+    // The number of frames is the duration times the frame rate.
     let timed = text.replace(r#""seconds": null"#, r#""seconds": 2.02, "render_width": 6.0"#);
     let SavedCameraPath { frames, size, .. } = parse(&timed).unwrap();
     assert_eq!((frames, size), (48, Some((6, 4))));
     let key = path.keyframes[0];
     assert_eq!(key.centre, DVec3::new(7.0, 8.0, 9.0));
     let camera = key.camera((40, 40));
-    // In the file, its z axis, (0, −1, 0), points backward, and its y axis, (0, 0, 1), upward.
+    // In the file, the camera's z axis, (0, −1, 0), points backward, and its y axis, (0, 0, 1), points up.
     assert!(camera.forward().distance(DVec3::Y) < 1e-9, "{}", camera.forward());
     assert!((-camera.rotation.row(1)).distance(DVec3::Z) < 1e-9);
     assert!((camera.fy - 20.0).abs() < 1e-9);
@@ -182,11 +182,11 @@ fn invalid_files_are_refused_with_the_reason() {
         (pose("0,0,0,0, 0,0,0,0, 0,0,0,0, 0,0,0,1", "50"), "shears"),
         (r#"{"camera_type": "fisheye", "camera_path": []}"#.to_owned(), "fisheye"),
     ] {
-        let refused = parse(&text).unwrap_err();
-        assert!(refused.contains(reason), "{text}: {refused}");
+        let error = parse(&text).unwrap_err();
+        assert!(error.contains(reason), "{text}: {error}");
     }
-    let sound = pose(unit, "50");
-    assert!(parse(&sound).is_ok());
+    let valid = pose(unit, "50");
+    assert!(parse(&valid).is_ok());
     for (field, reason) in [
         (r#""fps": 0"#, "fps is 0"),
         (r#""fps": 1001"#, "fps is 1001"),
@@ -194,8 +194,8 @@ fn invalid_files_are_refused_with_the_reason() {
         (r#""seconds": 1e4, "fps": 60"#, "seconds times fps is 600000"),
         (r#""render_width": 20000"#, "render_width is 20000"),
     ] {
-        let text = sound.replacen('{', &format!("{{{field}, "), 1);
-        let refused = parse(&text).unwrap_err();
-        assert!(refused.contains(reason), "{text}: {refused}");
+        let text = valid.replacen('{', &format!("{{{field}, "), 1);
+        let error = parse(&text).unwrap_err();
+        assert!(error.contains(reason), "{text}: {error}");
     }
 }

@@ -33,7 +33,7 @@ pub fn write_atomically(
 pub enum WriteError<E> {
     /// The file cannot be written.
     Io(io::Error),
-    /// The contents cannot be produced.
+    /// The contents cannot be generated.
     Source(E),
 }
 
@@ -43,7 +43,7 @@ impl<E> From<io::Error> for WriteError<E> {
     }
 }
 
-/// Does the same as [`write_atomically`], for contents whose production may fail.
+/// Does the same as [`write_atomically`], for contents whose generation may fail.
 ///
 /// # Errors
 /// [`FileError::Io`], and the error in a [`WriteError::Source`]. An existing file then stays unchanged, and no
@@ -73,6 +73,7 @@ pub fn write_checked<E: From<FileError>>(
     })
 }
 
+/// Writes and checks a temporary file in `folder`, and renames it to `path`.
 fn replace<E>(
     folder: &Path,
     path: &Path,

@@ -1,5 +1,5 @@
 //! Fault injection for tests: everything that a run writes passes through here and can be made to fail. Without a
-//! fault this costs one read of a thread-local variable.
+//! fault, this costs only reads of a thread-local variable.
 
 use std::io::{self, Write};
 use std::path::Path;
@@ -54,7 +54,7 @@ mod faults {
     pub struct Fault {
         /// The operation.
         pub operation: Operation,
-        /// The end of the file's path.
+        /// The end of the path of the file it applies to.
         pub file: &'static str,
         /// The number of times that the operation succeeds before it fails.
         pub spared: u32,
@@ -79,8 +79,8 @@ mod faults {
     /// times that the fault occurred.
     pub fn with_fault<T>(fault: Option<Fault>, f: impl FnOnce() -> T) -> (T, u32) {
         INJECTION.replace(Injection { fault, count: 0, short_writes: fault.is_none() });
-        let done = f();
-        (done, INJECTION.take().count)
+        let result = f();
+        (result, INJECTION.take().count)
     }
 
     /// Fails if the fault applies to this operation and path.
@@ -104,6 +104,7 @@ mod faults {
         })
     }
 
+    /// The bytes that one call of `write` accepts.
     pub(super) fn shortened(bytes: &[u8]) -> &[u8] {
         let short_writes = INJECTION.with_borrow(|injection| injection.short_writes);
         if short_writes { &bytes[..bytes.len().min(1)] } else { bytes }

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 /// Errors of writing and reading files.
 #[derive(Debug, thiserror::Error)]
 pub enum FileError {
-    /// A file that densify had written is invalid.
+    /// A file that densify wrote is invalid.
     #[error(
         "{}: {problem}; this file was written by another version or changed by hand",
         file.display()
@@ -14,7 +14,7 @@ pub enum FileError {
     Malformed {
         /// The file.
         file: PathBuf,
-        /// The fault.
+        /// The problem.
         problem: String,
     },
     /// Reading or writing failed.
@@ -24,7 +24,7 @@ pub enum FileError {
         action: &'static str,
         /// The file or folder.
         path: PathBuf,
-        /// The error of the system.
+        /// The operating system's error.
         source: std::io::Error,
     },
 }
@@ -39,12 +39,12 @@ fn remedy(source: &std::io::Error) -> &'static str {
 }
 
 impl FileError {
-    /// An error about the contents of a file that densify had written.
+    /// An error about the contents of a file that densify wrote.
     pub fn malformed(file: &Path, problem: impl Display) -> Self {
         Self::Malformed { file: file.to_owned(), problem: problem.to_string() }
     }
 
-    /// Turns an error of the system into an error about `path`, for `map_err`.
+    /// A function for `map_err` that turns an I/O error into an error about `path`.
     pub fn io(action: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> Self {
         let path = path.to_owned();
         move |source| Self::Io { action, path, source }

@@ -7,7 +7,7 @@ use std::path::Path;
 
 /// The message for text in another encoding, often caused by a file name in the text.
 pub(super) const NOT_UTF8: &str = "it is not text in UTF-8; save it as UTF-8, and rename files whose names are in another encoding";
-/// The maximum size of a file of options `[bytes]`.
+/// Maximum size of a file that holds options `[bytes]`.
 pub const MAX_OPTIONS_BYTES: u64 = 4 << 20;
 
 /// Opens a file for reading. Pipes, sockets and devices are refused without waiting for their data.
@@ -53,12 +53,12 @@ pub fn read_text(path: &Path, limit: u64) -> io::Result<String> {
     })
 }
 
-/// The maximum unpacked size of a compressed file of `packed` bytes `[bytes]`.
+/// Maximum unpacked size `[bytes]` of a compressed file of `packed` bytes.
 pub fn max_unpacked_bytes(packed: u64) -> u64 {
     /// The limit for small files.
     const MIN_LIMIT: u64 = 64 << 20;
-    /// Limit per byte of a larger file. Models unpack to 2 to 5 times their size, or up to 20 times if
-    /// they have little colour; text tables to up to 10 times their size.
+    /// Limit per packed byte of a larger file. Models unpack to 2 to 5 times their packed size (up to 20 times if they
+    /// have little colour information), text tables to up to 10 times.
     const RATIO: u64 = 100;
     MIN_LIMIT.max(packed.saturating_mul(RATIO))
 }
@@ -136,8 +136,8 @@ mod tests {
     fn pipes_and_devices_are_refused_without_waiting() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("pipe");
-        let made = std::process::Command::new("mkfifo").arg(&path).status().unwrap();
-        assert!(made.success());
+        let status = std::process::Command::new("mkfifo").arg(&path).status().unwrap();
+        assert!(status.success());
         for path in [&path, Path::new("/dev/zero")] {
             let error = read_text(path, 10).unwrap_err().to_string();
             assert!(error.contains("not a file"), "{error}");

@@ -63,7 +63,7 @@ pub fn shrink(image: &Image8, width: u32, height: u32) -> Image8 {
     out
 }
 
-/// Resamples one channel with the filter of [`shrink`].
+/// Resamples one channel with the filter of [`shrink`]. Sizes are (width, height) `[px]`.
 pub fn shrink_channel(channel: &[u8], from: (u32, u32), to: (u32, u32)) -> Vec<u8> {
     let columns = spans(from.0, to.0);
     let mut out = Vec::with_capacity(to.0 as usize * to.1 as usize);
@@ -104,6 +104,7 @@ impl Span {
     }
 }
 
+/// The spans of `to` target pixels along an axis of `from` source pixels.
 fn spans(from: u32, to: u32) -> Vec<Span> {
     let scale = f64::from(from) / f64::from(to);
     (0..to)
@@ -141,7 +142,7 @@ mod tests {
     #[test]
     fn partly_covered_pixels_count_in_proportion() {
         let out = shrink(&grey(3, 1, &[30, 60, 240]), 2, 1);
-        // Pixel 0 covers the first and half of the second: (30 + 30) / 1.5.
+        // Target pixel 0 covers the first source pixel and half of the second: (30 + 30) / 1.5.
         assert_eq!(out, grey(2, 1, &[40, 180]));
         assert_eq!(shrink_channel(&[30, 60, 240], (3, 1), (2, 1)), [40, 180]);
         assert_eq!(shrink_channel(&[7], (1, 1), (3, 2)), [7; 6]);

@@ -1,6 +1,6 @@
 //! The ledger: the size of every buffer of a run, known before training.
 //!
-//! Every buffer is allocated once, at the size of the budget. The ledger lists them, so that users
+//! Every buffer is allocated once, at the size that the budget requires. The ledger lists them, so that users
 //! learn before training whether a run fits.
 
 use std::fmt;
@@ -19,7 +19,7 @@ pub struct Ledger {
 /// One buffer.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct LedgerLine {
-    /// The part of the program that uses it.
+    /// The part of the program, or phase of the run, that uses it.
     pub section: Section,
     /// Its contents.
     pub what: String,
@@ -35,7 +35,7 @@ fn is_false(flag: &bool) -> bool {
     !flag
 }
 
-/// Parts of the program, in the order of the table.
+/// Sections of the ledger's table, in their order: parts of the program, or phases of a run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Section {
@@ -55,7 +55,7 @@ pub enum Section {
     Passing,
     /// Allocated only while loading, and freed before training.
     Before,
-    /// Allocated only after training, when the buffers of training are freed.
+    /// Allocated only after training, when the host's training buffers have been freed.
     After,
     /// The program itself.
     Process,
@@ -85,7 +85,7 @@ impl Ledger {
         self.lines.push(LedgerLine { section, what: what.into(), bytes, on_device: false });
     }
 
-    /// Adds a buffer in GPU memory; adds its bytes to the line of the same name if there is one.
+    /// Adds a buffer in GPU memory; adds its bytes to the section's line of the same name if there is one.
     pub fn add_on_device(&mut self, section: Section, what: &str, bytes: u64) {
         let same =
             |line: &&mut LedgerLine| line.on_device && line.section == section && line.what == what;
@@ -98,20 +98,20 @@ impl Ledger {
         }
     }
 
-    /// The peak `[bytes]`: the process, and the largest of the three phases, which are loading, training and
-    /// measuring at the end.
+    /// Peak memory `[bytes]`: that of the process itself plus that of the largest phase (loading, training, or
+    /// measuring after training).
     pub fn total(&self) -> u64 {
         peak(&self.lines.iter().collect::<Vec<_>>())
     }
 
-    /// The peak of host memory until training has ended `[bytes]`.
+    /// Peak host memory until the end of training `[bytes]`.
     pub fn on_host(&self) -> u64 {
         let lines = self.lines.iter();
         let lines = lines.filter(|line| !line.on_device && line.section != Section::After);
         peak(&lines.collect::<Vec<_>>())
     }
 
-    /// The sum of all buffers in GPU memory, which stay allocated throughout `[bytes]`.
+    /// Sum of all buffers in GPU memory `[bytes]`. They stay allocated from the start of training to the run's end.
     pub fn on_device(&self) -> u64 {
         sum(self.lines.iter().filter(|line| line.on_device).map(|line| line.bytes))
     }
@@ -128,8 +128,9 @@ fn peak(lines: &[&LedgerLine]) -> u64 {
 
 /// Finds the lines whose buffers exist at the peak: those of the process and those of the largest phase.
 ///
-/// Only the largest line counts in each of [`Section::Passing`], [`Section::Before`] and [`Section::After`], as these
-/// never exist at the same time. GPU memory exists at the same time as [`Section::After`], but not [`Section::Before`].
+/// Only the largest line counts in each of [`Section::Passing`], [`Section::Before`] and [`Section::After`], as the
+/// buffers of such a section never coexist. Buffers in GPU memory coexist with those of [`Section::After`], but not
+/// with those of [`Section::Before`].
 fn held_at_peak(lines: &[&LedgerLine]) -> Vec<bool> {
     let largest = |section| {
         let indices = (0..lines.len()).filter(|&i| lines[i].section == section);
@@ -145,7 +146,7 @@ fn held_at_peak(lines: &[&LedgerLine]) -> Vec<bool> {
     let bytes = |is_held: &&dyn Fn(usize) -> bool| {
         sum((0..lines.len()).filter(|&i| is_held(i)).map(|i| lines[i].bytes))
     };
-    // If phases are equal, this is the last one: training.
+    // Of equally large phases, this is the last: training.
     let largest = phases.iter().copied().max_by_key(bytes);
     let is_held = |i: usize| {
         lines[i].section == Section::Process || largest.is_some_and(|is_held| is_held(i))
@@ -169,7 +170,7 @@ impl fmt::Display for Ledger {
             let before = sum;
             let size = if is_held {
                 sum = sum.saturating_add(line.bytes);
-                // The difference of two rounded sums, so that the lines add up.
+                // The difference of two rounded sums, so that the printed sizes add up.
                 format!("{:>14}", mebibytes(tenths(sum) - tenths(before)))
             } else {
                 format!("{:>15}", format!("({})", mebibytes(tenths(line.bytes))))
@@ -230,7 +231,7 @@ mod tests {
         assert_eq!(ledger.total(), total);
         ledger.add_to(Section::Before, "measuring more", 38 << 20);
         assert_eq!(ledger.total(), 41 << 20);
-        // GPU memory exists at the same time as the buffers after training.
+        // Buffers in GPU memory coexist with those allocated after training.
         ledger.add_to(Section::After, "measuring the model", 39 << 20);
         assert_eq!(ledger.total(), 42 << 20);
         ledger.add_on_device(Section::Renderer, "on the device", 2 << 20);

@@ -1,8 +1,8 @@
 //! Datasets in ZIP archives, unpacked into a temporary folder that is removed with the dataset's last view.
 //!
-//! The readers of all formats then see a folder, from which photographs are decoded as fast as from any other. Archives
-//! are untrusted: no name leads out of the folder, no links are created, and the unpacked size is bounded before and
-//! during unpacking.
+//! The reader of each format then sees an ordinary folder, from which photographs are decoded as fast as from any other
+//! folder. Archives are untrusted: no name leads out of the folder, no links are created, and the unpacked size is
+//! bounded before and during unpacking.
 
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, BufReader, Read};
@@ -20,13 +20,13 @@ use crate::models::folder_in_archive;
 use densify_core::files;
 use densify_core::memory::Bytes;
 
-/// Largest number of files in an archive.
+/// Largest accepted number of files in an archive.
 const MAX_FILES: usize = 4_000_000;
 /// Maximum number of nested folders around the dataset's folder, each of which contains only the next one.
 const MAX_OUTER_FOLDERS: usize = 8;
 /// Names of files and folders that operating systems add to archives.
 const SYSTEM_FILES: [&str; 4] = ["__MACOSX", ".DS_Store", "Thumbs.db", "desktop.ini"];
-const REMEDY: &str = "pack the folder again, or unpack it and name the folder";
+const REMEDY: &str = "pack the folder again, or unpack the archive and give that folder instead";
 
 /// The files of an archive in a temporary folder, which is removed when this value is dropped.
 #[derive(Debug)]
@@ -38,7 +38,7 @@ pub(super) struct Unpacked {
     bytes: u64,
 }
 
-/// Returns true if a file's contents are a complete ZIP archive other than a SOG model.
+/// Returns true if a file, whatever its name, is a complete ZIP archive other than a SOG model.
 pub fn is_archive(path: &Path) -> bool {
     let is_model = |archive: &ZipArchive<BufReader<File>>| {
         let names: Vec<_> = archive.file_names().flatten().collect();
@@ -68,9 +68,9 @@ pub(super) fn load(path: &Path, options: &LoadOptions) -> Result<Dataset, LoadEr
             *text = unpacked.with_archive_name(text);
         }
     }
-    let (bytes, place) = (Bytes(unpacked.bytes), unpacked.temporary.path().display());
+    let (bytes, folder) = (Bytes(unpacked.bytes), unpacked.temporary.path().display());
     dataset.notes.push(Note::Text(format!(
-        "{} is unpacked in {place} ({bytes}) while this command runs",
+        "{} is unpacked in {folder} ({bytes}) while this command runs",
         path.display()
     )));
     for View { source, .. } in dataset.train.iter_mut().chain(&mut dataset.test) {
@@ -87,13 +87,13 @@ pub(super) fn load(path: &Path, options: &LoadOptions) -> Result<Dataset, LoadEr
 impl Unpacked {
     fn new(path: &Path) -> Result<Self, LoadError> {
         let mut archive = open(path)?;
-        let most = max_unpacked_bytes(path)?;
-        let bytes = check(path, &mut archive, most)?;
+        let max_bytes = max_unpacked_bytes(path)?;
+        let bytes = checked_size(path, &mut archive, max_bytes)?;
         let temporary = tempfile::Builder::new()
             .prefix("densify-zip-")
             .tempdir()
             .map_err(|error| no_room(path, &std::env::temp_dir(), bytes, &error))?;
-        let mut left = most;
+        let mut bytes_left = max_bytes;
         for index in 0..archive.len() {
             let mut file = archive.by_index(index).map_err(|error| broken(path, &error))?;
             let Some(name) = data_name(path, &file)? else { continue };
@@ -108,15 +108,15 @@ impl Unpacked {
                 }
                 _ => no_room(path, temporary.path(), bytes, &error),
             })?;
-            // The length in the table of contents is only a claim.
-            let mut input = (&mut file).take(left + 1);
+            // The length in the table of contents may be false.
+            let mut input = (&mut file).take(bytes_left + 1);
             let copied = copy(&mut input, &mut output).map_err(|error| match error {
-                Copying::Reading(error) => {
+                CopyError::Read(error) => {
                     malformed(path, &name, format!("it cannot be unpacked: {error}"))
                 }
-                Copying::Writing(error) => no_room(path, temporary.path(), bytes, &error),
+                CopyError::Write(error) => no_room(path, temporary.path(), bytes, &error),
             })?;
-            left = left.checked_sub(copied).ok_or_else(|| bomb(path, most))?;
+            bytes_left = bytes_left.checked_sub(copied).ok_or_else(|| zip_bomb(path, max_bytes))?;
         }
         let folder = innermost(temporary.path());
         Ok(Self { archive: path.to_owned(), temporary, folder, bytes })
@@ -170,10 +170,10 @@ fn max_unpacked_bytes(path: &Path) -> Result<u64, LoadError> {
 }
 
 /// Checks the table of contents; returns the size of the unpacked files `[bytes]`.
-fn check<R: Read + io::Seek>(
+fn checked_size<R: Read + io::Seek>(
     path: &Path,
     archive: &mut ZipArchive<R>,
-    most: u64,
+    max_bytes: u64,
 ) -> Result<u64, LoadError> {
     if archive.len() > MAX_FILES {
         return Err(malformed(path, "archive", format!("it has more than {MAX_FILES} files")));
@@ -185,7 +185,7 @@ fn check<R: Read + io::Seek>(
             bytes = bytes.saturating_add(file.size());
         }
     }
-    if bytes > most { Err(bomb(path, most)) } else { Ok(bytes) }
+    if bytes > max_bytes { Err(zip_bomb(path, max_bytes)) } else { Ok(bytes) }
 }
 
 /// The path of a file in the archive; `None` for folders and for files that operating systems add.
@@ -231,21 +231,21 @@ fn innermost(folder: &Path) -> PathBuf {
     folder
 }
 
-enum Copying {
-    Reading(io::Error),
-    Writing(io::Error),
+enum CopyError {
+    Read(io::Error),
+    Write(io::Error),
 }
 
 /// Copies a file; the error distinguishes a damaged archive from a full disk.
-fn copy(input: &mut impl Read, output: &mut File) -> Result<u64, Copying> {
+fn copy(input: &mut impl Read, output: &mut File) -> Result<u64, CopyError> {
     let mut buffer = vec![0; 1 << 16];
     let mut copied = 0;
     loop {
-        let read = input.read(&mut buffer).map_err(Copying::Reading)?;
+        let read = input.read(&mut buffer).map_err(CopyError::Read)?;
         if read == 0 {
             return Ok(copied);
         }
-        io::Write::write_all(output, &buffer[..read]).map_err(Copying::Writing)?;
+        io::Write::write_all(output, &buffer[..read]).map_err(CopyError::Write)?;
         copied += read as u64;
     }
 }
@@ -258,19 +258,19 @@ fn broken(path: &Path, error: &ZipError) -> LoadError {
     malformed(path, "archive", error)
 }
 
-fn bomb(path: &Path, most: u64) -> LoadError {
+fn zip_bomb(path: &Path, limit: u64) -> LoadError {
     let problem =
-        format!("it unpacks to more than {}, which is implausible for photographs", Bytes(most));
-    let remedy = "unpack it yourself if you trust it, and name the folder";
+        format!("it unpacks to more than {}, which is implausible for photographs", Bytes(limit));
+    let remedy = "unpack it yourself if you trust it, and give the unpacked folder instead";
     LoadError::malformed(path, "archive", problem, remedy)
 }
 
-fn no_room(path: &Path, place: &Path, bytes: u64, error: &io::Error) -> LoadError {
+fn no_room(path: &Path, folder: &Path, bytes: u64, error: &io::Error) -> LoadError {
     LoadError::Data(format!(
-        "cannot unpack {} into {}: {error}; set TMPDIR to a folder with room for {}, or unpack it yourself and name \
-         that folder",
+        "cannot unpack {} into {}: {error}; set TMPDIR to a folder with room for {}, or unpack it yourself and give \
+         the unpacked folder instead",
         path.display(),
-        place.display(),
+        folder.display(),
         Bytes(bytes)
     ))
 }

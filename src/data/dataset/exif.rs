@@ -26,7 +26,7 @@ const SENSITIVITIES: RangeInclusive<f64> = 1.0..=1e8;
 #[derive(Debug, Clone, Default, PartialEq)]
 pub(super) struct Exif {
     orientation: Option<Orientation>,
-    /// Brightness of the exposure `[stops above 1 s at f/1 and ISO 1]`, or the implausible value.
+    /// The exposure `[stops above 1 s at f/1 and ISO 1]`, or the implausible value; `None` if a field is missing.
     exposure: Option<Result<f64, String>>,
 }
 
@@ -46,7 +46,7 @@ impl Exif {
         Self { orientation: orientation(&fields), exposure: exposure(&fields) }
     }
 
-    /// The quarter turn that makes the photograph upright, if there is one. Other orientations keep width and height.
+    /// The quarter turn that makes the photograph upright, if it needs one. Other orientations keep width and height.
     pub(super) fn quarter_turn(&self) -> Option<Orientation> {
         self.orientation.filter(|turn| (5..=8).contains(&turn.to_exif()))
     }
@@ -57,7 +57,7 @@ fn orientation(fields: &exif::Exif) -> Option<Orientation> {
     Orientation::from_exif(u8::try_from(number).ok()?)
 }
 
-/// As [`Exif::exposure`]; `None` if a field is missing.
+/// As [`Exif::exposure`].
 fn exposure(fields: &exif::Exif) -> Option<Result<f64, String>> {
     let number = |tag| match &fields.get_field(tag, In::PRIMARY)?.value {
         Value::Rational(values) => values.first().map(exif::Rational::to_f64),
@@ -80,7 +80,7 @@ fn exposure(fields: &exif::Exif) -> Option<Result<f64, String>> {
 /// Exposures of views according to the EXIF fields of their photographs.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct ReportedExposures {
-    /// Brightness of the exposure of each view `[stops above 1 s at f/1 and ISO 1]`, if reported. Shape: `[views]`.
+    /// Exposure of each view `[stops above 1 s at f/1 and ISO 1]`, if reported. Shape: `[views]`.
     pub stops: Vec<Option<f64>>,
     /// Number of views with implausible values.
     pub implausible: usize,
@@ -92,7 +92,7 @@ impl ReportedExposures {
     /// Collects the exposures of these views, reading the EXIF of each photograph that has not been read yet.
     pub fn read(views: &[View]) -> Self {
         let mut all = Self::default();
-        // The views of one photograph follow each other.
+        // The views of one photograph are consecutive.
         let mut last: Option<(&Path, Exif)> = None;
         for View { name, source, .. } in views {
             let path = &*source.file.path;

@@ -12,7 +12,7 @@ use super::paths::{DataPath, Root, is_absolute, relative};
 use super::{Frame, LoadOptions, Resolution};
 
 /// Extensions that are tried for names without one, as in NeRF-synthetic files.
-const ENDINGS: [&str; 8] = ["", ".png", ".jpg", ".jpeg", ".webp", ".PNG", ".JPG", ".JPEG"];
+const EXTENSIONS: [&str; 8] = ["", ".png", ".jpg", ".jpeg", ".webp", ".PNG", ".JPG", ".JPEG"];
 
 /// Extensions of photographs that COLMAP reads.
 const PHOTOGRAPHS: [&str; 7] = ["jpg", "jpeg", "png", "webp", "tif", "tiff", "bmp"];
@@ -81,7 +81,7 @@ impl Folders {
         }
     }
 
-    /// The folder given by `--images`, if `value` is an absolute path, which mostly comes from another machine.
+    /// The folder given by `--images`, if `value` is an absolute path. Such paths mostly come from another machine.
     pub(super) fn folder_for_absolute(&self, value: &str) -> Option<&Root> {
         self.chosen.as_ref().filter(|_| is_absolute(value))
     }
@@ -94,7 +94,7 @@ impl Folders {
             let within = format!("{inside}{ending}");
             let mut fell_back = false;
             if let Some((folder, k)) = &self.reduced {
-                // The folder itself may be a link out of the dataset.
+                // Refuses a folder that is itself a link out of the dataset.
                 let below_root = format!("images_{k}/{within}");
                 self.root.existing(DataPath { value: &below_root, ..named })?;
                 if let Some(path) = folder.existing(DataPath { value: &within, ..named })? {
@@ -117,7 +117,7 @@ impl Folders {
         Ok(None)
     }
 
-    /// The image below the folder whose path is the longest existing suffix of an absolute path.
+    /// The image in `folder` at the longest suffix of an absolute path that exists there.
     fn image_by_suffix(
         &self,
         folder: &Root,
@@ -136,14 +136,14 @@ impl Folders {
 
     /// Extensions to try; names in COLMAP models always have one.
     fn endings(&self) -> &'static [&'static str] {
-        if self.within_images { &ENDINGS[..1] } else { &ENDINGS }
+        if self.within_images { &EXTENSIONS[..1] } else { &EXTENSIONS }
     }
 
     pub(super) fn missing(&self, named: DataPath<'_>) -> LoadError {
         LoadError::missing_image(named.file, named.field, &self.first_path(named))
     }
 
-    /// The first path at which an image is looked for.
+    /// The first path that is tried for an image.
     pub(super) fn first_path(&self, named: DataPath<'_>) -> PathBuf {
         match &self.chosen {
             Some(folder) if is_absolute(named.value) => {
@@ -155,7 +155,7 @@ impl Folders {
         }
     }
 
-    /// Number of photographs in the folder of images that belong to no frame.
+    /// Number of photographs in the folder of images that no frame uses.
     pub(super) fn count_others(&self, frames: &[Frame]) -> usize {
         let images = self.root.path().join("images");
         let folder = match (&self.chosen, &self.reduced) {
@@ -167,7 +167,7 @@ impl Folders {
         // If the dataset lies in the chosen folder, that folder's subfolders are not searched for further photographs.
         let is_deep = !self.chosen.as_ref().is_some_and(|folder| folder.contains(&self.root));
         add_photographs(folder, "", is_deep, &mut names);
-        // Names may have several Unicode spellings.
+        // A name may have several Unicode spellings.
         let spelled = |name: &str| name.nfc().collect::<String>();
         let used: HashSet<String> = frames.iter().map(|frame| spelled(&frame.name)).collect();
         names.iter().filter(|name| !used.contains(&spelled(name))).count()
@@ -197,7 +197,7 @@ impl Folders {
     }
 }
 
-/// Adds the names of the photographs in a folder and, if `is_deep`, in its subfolders, without masks and hidden files.
+/// Adds the names of the photographs in a folder and, if `is_deep`, in its subfolders, except masks and hidden files.
 fn add_photographs(folder: &Path, inside: &str, is_deep: bool, names: &mut Vec<String>) {
     for entry in fs::read_dir(folder).into_iter().flatten().flatten() {
         let file = entry.file_name();

@@ -7,11 +7,11 @@ use super::{LoadError, LoadOptions, Scene, colmap, realitycapture, transforms};
 /// A format of datasets in folders.
 #[derive(Debug, Clone, Copy)]
 pub struct DatasetFormat {
-    /// Name, also of the folder with its fuzz corpus.
+    /// Name of the format and of the folder with its fuzz corpus.
     pub name: &'static str,
     /// The program or data set that the format comes from, for messages.
     pub title: &'static str,
-    /// A file of the format, relative to the dataset. Fuzz inputs that are one file get this name.
+    /// A file of the format, relative to the dataset. Fuzz inputs that consist of one file get this name.
     pub file: &'static str,
     /// The files that identify the format, for messages.
     pub files: &'static str,
@@ -24,10 +24,10 @@ pub fn formats() -> &'static [&'static DatasetFormat] {
     &[&transforms::SPLIT_FORMAT, &colmap::FORMAT, &transforms::FORMAT, &realitycapture::FORMAT]
 }
 
-/// Reads a folder by the first format that recognises it.
+/// Reads a folder with the reader of the first format that recognises it.
 ///
 /// # Errors
-/// When no format does, or a file is unreadable or contradicts itself.
+/// When no format recognises the folder, or a file is unreadable or contradicts itself.
 pub(super) fn read_scene(root: &Root, options: &LoadOptions) -> Result<Scene, LoadError> {
     // Only COLMAP has models to choose from.
     let chosen = options.sparse.is_some();
@@ -37,7 +37,7 @@ pub(super) fn read_scene(root: &Root, options: &LoadOptions) -> Result<Scene, Lo
         }
     }
     Err(LoadError::Data(format!(
-        "{} is not a dataset: it has neither the files of {}; name a folder or ZIP archive with one of these",
+        "{} is not a dataset: it has neither the files of {}; give a folder or ZIP archive with one of these",
         root.path().display(),
         formats()
             .iter()

@@ -1,8 +1,8 @@
 //! nerfstudio's lists of the frames to train on, to validate with and to test on.
 //!
-//! Only the frames listed for training are trained on; without a list for training, all frames that no other list
-//! names. Test views are the frames listed for tests or, if there are none, those listed for validation. A frame listed
-//! for validation is trained on only if it is listed for training, too.
+//! Only the frames listed for training are trained on; if there is no such list, all frames that no other list names
+//! are trained on. Test views are the frames listed for tests or, if there are none, those listed for validation. A
+//! frame listed for validation is trained on only if it is listed for training, too.
 
 use std::collections::HashMap;
 use std::path::PathBuf;
@@ -14,7 +14,7 @@ use super::paths::{DataPath, relative};
 /// The lists, in the order of [`FrameLists::lists`].
 pub(super) const FIELDS: [&str; 3] = ["train_filenames", "val_filenames", "test_filenames"];
 
-/// The names in a list by the image that each refers to, and whether a frame has this image.
+/// The names in a list by the image that each refers to; true if a frame has this image.
 type Names = HashMap<PathBuf, (String, bool)>;
 
 /// The lists of a file, and how its frames are used according to them.
@@ -33,13 +33,13 @@ pub(super) struct FrameLists {
     trained: usize,
 }
 
-/// What identifies a frame: its image or, if that is missing, the path as listed.
+/// The key of a frame: its image or, if that is missing, the path as listed.
 fn key(value: &str, found: Option<&ImageFile>) -> PathBuf {
     found.map_or_else(|| relative(&value.replace('\\', "/")).into(), |found| found.path.clone())
 }
 
 impl FrameLists {
-    /// Adds the list of a field.
+    /// Adds the list in the field `FIELDS[list]`.
     pub(super) fn add(
         &mut self,
         folders: &Folders,
@@ -83,20 +83,20 @@ impl FrameLists {
         self.lists[list].as_ref().is_some_and(|names| !names.is_empty())
     }
 
-    /// The first list that defines which frames are tested on; only a list for training may be empty.
-    fn decisive(&self) -> Option<usize> {
+    /// The first list that defines which frames are tested on. An empty validation or test list defines none.
+    fn defining_list(&self) -> Option<usize> {
         (0..3).find(|&list| self.names_any(list) || list == 0 && self.lists[0].is_some())
     }
 
     /// Whether the lists define which frames are tested on.
     pub(super) fn define_the_split(&self) -> bool {
-        self.decisive().is_some()
+        self.defining_list().is_some()
     }
 
     /// The field that is wrong and its problem: a name that no frame has, or no frame to train on.
     pub(super) fn fault(&self) -> Option<(&'static str, String)> {
         for (field, names) in FIELDS.iter().zip(&self.lists) {
-            let unmatched = || names.iter().flat_map(HashMap::values).filter(|(_, is)| !is);
+            let unmatched = || names.iter().flat_map(HashMap::values).filter(|(_, used)| !used);
             if let Some(name) = unmatched().map(|(name, _)| name).min() {
                 let more = match unmatched().count() - 1 {
                     0 => String::new(),
@@ -108,7 +108,7 @@ impl FrameLists {
         }
         let leaves_none = self.trained == 0 && self.frames > 0;
         let problem = || "it leaves no frame to train on".to_owned();
-        self.decisive().filter(|_| leaves_none).map(|list| (FIELDS[list], problem()))
+        self.defining_list().filter(|_| leaves_none).map(|list| (FIELDS[list], problem()))
     }
 
     /// Notes for the user about frames that would be used differently without lists.

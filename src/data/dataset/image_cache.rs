@@ -1,9 +1,8 @@
 //! A cache of decoded images with a size limit, filled ahead of use by background threads.
 //!
-//! Training visits every view once per epoch, in a new order each time. The next use of the view used
-//! last is therefore the furthest away on average, so the most recently used image that is not
-//! announced is evicted first. (Least-recently-used eviction would almost always miss once the images
-//! do not all fit.)
+//! Training visits every view once per epoch, in a new order each time. On average, the view used last is therefore the
+//! last to be needed again, so the most recently used image that is not announced is evicted first.
+//! (Least-recently-used eviction would almost always miss once the images do not all fit.)
 
 use std::collections::VecDeque;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -25,9 +24,9 @@ struct Shared {
     sources: Vec<ImageSource>,
     capacity: u64,
     state: Mutex<State>,
-    /// Signalled when an image was queued, memory became available, or the threads are to end.
+    /// Signalled when an image has been queued, memory has become available, or the threads must end.
     work: Condvar,
-    /// Signalled when an image was loaded.
+    /// Signalled when an image has been loaded.
     loaded: Condvar,
 }
 
@@ -45,7 +44,7 @@ struct State {
 #[derive(Debug, Default)]
 struct Slot {
     content: Content,
-    /// True if the image was announced and not fetched since.
+    /// True if the image has been announced and not been fetched since.
     is_announced: bool,
     /// Value of the clock at the last use.
     used: u64,
@@ -61,9 +60,8 @@ enum Content {
 }
 
 impl ImageCache {
-    /// A cache of at most `cache_bytes` of decoded images, or of two images if that is more.
-    /// `threads` decode the images announced by [`Self::prefetch`]; with 0 threads, all images are
-    /// decoded on demand.
+    /// A cache of at most `cache_bytes` of decoded images, or of two images if that is more. `threads` background
+    /// threads decode the images announced by [`Self::prefetch`]; with 0 threads, all images are decoded on demand.
     pub(crate) fn new(sources: Vec<ImageSource>, cache_bytes: u64, threads: usize) -> Self {
         let capacity = ImageDemand::total(sources.iter()).capacity(cache_bytes);
         let slots = sources.iter().map(|_| Slot::default()).collect();
@@ -108,7 +106,7 @@ impl ImageCache {
         self.shared.work.notify_all();
     }
 
-    /// The image of source `index`; decodes it, or waits while a background thread does.
+    /// The image of source `index`; decodes it, or waits until a background thread has decoded it.
     ///
     /// # Errors
     /// When the file cannot be loaded. The next call tries again.
@@ -198,7 +196,8 @@ impl Shared {
 }
 
 impl State {
-    /// Reserves memory for an image by evicting the most recently used images that are not announced.
+    /// Reserves memory for an image by evicting the most recently used images that are not announced. Returns false if
+    /// that is not enough.
     fn make_room(&mut self, shared: &Shared, index: usize) -> bool {
         let needed = shared.sources[index].loaded_bytes();
         while self.bytes + needed > shared.capacity {
@@ -240,7 +239,7 @@ pub struct ImageDemand {
 }
 
 impl ImageDemand {
-    /// The demand of these images.
+    /// The memory that these images need.
     pub fn total<'a>(sources: impl Iterator<Item = &'a ImageSource>) -> Self {
         sources.fold(Self { all: 0, largest: 0, working: 0 }, |sum, source| {
             let loaded = source.loaded_bytes();
@@ -322,7 +321,7 @@ mod tests {
                 cache.get(index).unwrap();
             }
         }
-        // Of 54 later accesses, at least 3 in 6 hit; least-recently-used eviction would hit none.
+        // Of 54 accesses after the first round, at least 3 in 6 hit; none would with least-recently-used eviction.
         assert!(hits >= 27, "{hits}");
         assert_eq!(held(&cache).len(), 4);
     }

@@ -1,6 +1,6 @@
 //! Decodes photographs, undistorts them and shrinks them to the training resolution.
 //!
-//! Files are untrusted: sides, pixels and decoded bytes are checked before anything is allocated.
+//! Files are untrusted: the sides, the number of pixels and the decoded size are checked before anything is allocated.
 
 use std::fs::File;
 use std::io::{BufRead, BufReader, Cursor, Read, Seek};
@@ -55,7 +55,7 @@ pub struct ImageSource {
     pub header: ImageHeader,
     /// Pixels in memory, at the size of the header, instead of a file.
     pub rendered: Option<SharedImage>,
-    /// The part of the result that is used, if not all.
+    /// The part of the loaded image that is used; `None`: the whole image.
     pub window: Option<Window>,
 }
 
@@ -83,11 +83,11 @@ impl ImageSource {
         let header = read_header(&path).expect("an image");
         let (width, height) = (header.width, header.height);
         let (mask, undistortion, rendered) = (None, None, None);
-        let file = SourceFile::found(path).expect("an image");
+        let file = SourceFile::existing(path).expect("an image");
         Self { file, mask, width, height, undistortion, header, rendered, window: None }
     }
 
-    /// Pixels in memory, which messages call `name`, shrunk to this size on load.
+    /// Pixels in memory, which are shrunk to this size on load. Messages call them `name`.
     pub(crate) fn rendered(name: PathBuf, image: Image8, (width, height): (u32, u32)) -> Self {
         let header = ImageHeader {
             width: image.width,
@@ -162,7 +162,7 @@ impl ImageSource {
     /// Decodes, undistorts, shrinks and crops the image. The result has alpha only if a pixel is transparent.
     ///
     /// # Errors
-    /// When a file is missing, unreadable, over the limits, or differs from the header read at first.
+    /// When a file is missing, unreadable or over the limits, or its size is no longer that in the header.
     pub fn load(&self) -> Result<Image8, LoadError> {
         let image = self.load_whole()?;
         Ok(match self.window {
@@ -185,8 +185,8 @@ impl ImageSource {
             decoded.apply_orientation(turn);
         }
         if (decoded.width(), decoded.height()) != (header.width, header.height) {
-            let found = (decoded.width(), decoded.height());
-            return Err(LoadError::size(&self.file.path, found, (header.width, header.height)));
+            let size = (decoded.width(), decoded.height());
+            return Err(LoadError::size(&self.file.path, size, (header.width, header.height)));
         }
         let mut image = pack(decoded);
         if let Some(mask) = &self.mask {
@@ -202,7 +202,7 @@ impl ImageSource {
     }
 }
 
-/// Converts to 8 bits per channel, without a copy if the image is RGB already.
+/// Converts an image to 8 bits per channel, without a copy if it is 8-bit RGB already.
 fn pack(decoded: DynamicImage) -> Image8 {
     let (width, height) = (decoded.width(), decoded.height());
     if !decoded.color().has_alpha() {
@@ -246,7 +246,7 @@ fn header_of(path: &Path, file: &mut File) -> Result<ImageHeader, LoadError> {
     let mut start = Vec::new();
     file.take(HEADER_BYTES).read_to_end(&mut start).map_err(LoadError::io(path))?;
     if let Some(problem) = files::wrong_kind(&start) {
-        return Err(LoadError::malformed(path, "the image", problem, "put the image there"));
+        return Err(LoadError::malformed(path, "the image", problem, "restore the image"));
     }
     let header = match parse_header(Cursor::new(&start), file_bytes) {
         // The header may follow a long preview or colour profile.

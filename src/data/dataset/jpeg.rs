@@ -33,7 +33,7 @@ pub(super) fn decode(bytes: &[u8]) -> Result<DynamicImage, String> {
     } else {
         RgbImage::from_raw(width, height, pixels).map(DynamicImage::from)
     };
-    image.ok_or_else(|| "the decoder returned another number of pixels".to_owned())
+    image.ok_or_else(|| "the decoder returned a wrong number of pixels".to_owned())
 }
 
 /// Returns true if an end marker follows the first scan. Earlier segments are skipped by their lengths, since an

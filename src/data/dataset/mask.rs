@@ -31,7 +31,7 @@ pub enum Hides {
 }
 
 impl Mask {
-    /// Decodes the mask at its own size; weight 0 is hidden. `check` may refuse its header first.
+    /// Decodes the mask at its own size; weight 0 hides a pixel. `check` sees the header first and may refuse it.
     ///
     /// The decoded mask is not kept: masks of all photographs together would exceed the planned memory.
     pub(super) fn read_weights(
@@ -75,7 +75,7 @@ impl Mask {
     }
 }
 
-/// The values of a mask. If none exceeds 1, the mask consists of 0 and 1, as Boolean arrays are often saved, and 1
+/// The values of a mask. If no value exceeds 1, the mask consists of 0 and 1, as Boolean arrays are often saved, and 1
 /// counts as 255.
 fn values(mask: DynamicImage) -> GrayImage {
     let mut values = match mask {
@@ -140,7 +140,7 @@ mod tests {
     }
 
     fn mask_of(path: PathBuf, hides: Hides) -> Mask {
-        Mask { file: SourceFile::found(path).unwrap(), hides, mode: MaskMode::Ignore }
+        Mask { file: SourceFile::existing(path).unwrap(), hides, mode: MaskMode::Ignore }
     }
 
     /// Masked pixels and transparent pixels of the photograph are both transparent.
@@ -180,7 +180,7 @@ mod tests {
         assert_eq!(read([[7, 255], [7, 255]]), [7, 7]);
     }
 
-    /// 1 is full only if no value exceeds it.
+    /// 1 counts as 255 only if no value exceeds it.
     #[test]
     fn a_mask_may_consist_of_0_and_1() {
         let read = |pixels: [u8; 3]| {

@@ -13,11 +13,11 @@ use super::paths::{DataPath, Root};
 /// Suffix of RealityCapture's mask layers.
 const LAYER: &str = ".mask.png";
 /// Suffix of 3DGRUT's masks.
-const BESIDE: &str = "_mask.png";
+const GRUT: &str = "_mask.png";
 /// Prefix of instant-ngp's dynamic masks.
 const DYNAMIC: &str = "dynamic_mask_";
 
-/// Folders of masks in the dataset, in any case of letters, in order of precedence.
+/// Names of the dataset's folders of masks, in order of precedence. Upper and lower case are not distinguished.
 const FOLDERS: [&str; 4] = ["masks", "mask", "segmentation", "dynamic_masks"];
 
 /// The file of a mask.
@@ -35,19 +35,19 @@ impl MaskFile {
     }
 }
 
-/// Returns true if a file beside photographs is the mask of a photograph.
+/// Returns true if a file of this name beside photographs is the mask of a photograph.
 pub(super) fn is_mask(name: &OsStr) -> bool {
     name.to_str().is_some_and(|name| {
-        [LAYER, BESIDE].iter().any(|suffix| name.ends_with(suffix)) || name.starts_with(DYNAMIC)
+        [LAYER, GRUT].iter().any(|suffix| name.ends_with(suffix)) || name.starts_with(DYNAMIC)
     })
 }
 
-/// Returns true if masks are in folders of this name.
+/// Returns true if folders of this name contain masks.
 pub(super) fn is_mask_folder(name: &str) -> bool {
     precedence(name).is_some()
 }
 
-/// The place of a folder's name among those that hold masks.
+/// The index of a folder's name in [`FOLDERS`], ignoring case.
 fn precedence(name: &str) -> Option<usize> {
     FOLDERS.iter().position(|known| known.eq_ignore_ascii_case(name))
 }
@@ -56,11 +56,11 @@ fn precedence(name: &str) -> Option<usize> {
 pub(super) fn folders(dataset: &Path) -> Vec<String> {
     let entries = dataset.read_dir().into_iter().flatten().flatten();
     let names = entries.filter_map(|entry| entry.file_name().into_string().ok());
-    let mut found: Vec<String> =
+    let mut folders: Vec<String> =
         names.filter(|name| is_mask_folder(name) && dataset.join(name).is_dir()).collect();
-    // Names in lower case first.
-    found.sort_by_cached_key(|name| (precedence(name), std::cmp::Reverse(name.clone())));
-    found
+    // Names in lower case come first.
+    folders.sort_by_cached_key(|name| (precedence(name), std::cmp::Reverse(name.clone())));
+    folders
 }
 
 /// Note about a folder of masks, for datasets in which no photograph has a mask.
@@ -85,7 +85,7 @@ impl Folders {
         named: DataPath<'_>,
     ) -> Result<Option<MaskFile>, LoadError> {
         let at = |root: &Root, value: String| root.existing(DataPath { value: &value, ..named });
-        // The name of the file has an extension, which the listed name may lack.
+        // The file's name has an extension, which the listed name may lack.
         let listed = self.inside_images(&image.name);
         let file = image.path.file_name().and_then(OsStr::to_str).unwrap_or_default();
         let (inside, stem) = (with_file_name(&listed, file), stem(file));
@@ -111,7 +111,7 @@ impl Folders {
             for value in [
                 format!("{file}{LAYER}"),
                 format!("{stem}{LAYER}"),
-                format!("{stem}{BESIDE}"),
+                format!("{stem}{GRUT}"),
                 format!(".mask/{stem}.png"),
                 format!("{DYNAMIC}{stem}.png"),
             ] {
@@ -124,7 +124,7 @@ impl Folders {
         Ok(None)
     }
 
-    /// The root folder of an image, and the paths below this folder of the image and of its full-size original.
+    /// The root folder of an image and, below this folder, the paths of the image and of its full-size original.
     fn image_places(&self, image: &ImageFile) -> (&Root, Vec<String>) {
         let root = self.chosen.as_ref().unwrap_or(&self.root);
         let path = image.path.strip_prefix(root.path()).unwrap_or(&image.path);

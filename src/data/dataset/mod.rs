@@ -1,7 +1,7 @@
 //! Loads datasets: photographs with known cameras, in any of the supported formats.
 //!
-//! `formats` lists the formats; the first that recognises its files in a folder reads it. A ZIP archive is read as the
-//! folder inside it. All files are untrusted: see [`LoadError`].
+//! `formats` lists the formats; the first format that recognises its files in a folder reads the folder. A ZIP archive
+//! is read as the folder inside it. All files are untrusted: see [`LoadError`].
 
 mod archive;
 pub mod builtin;
@@ -73,7 +73,7 @@ pub use window::Part;
 pub struct Dataset {
     /// Folder or archive of the dataset. All images lie inside it unless the options name another folder of images.
     pub root: PathBuf,
-    /// The unpacked files of an archive.
+    /// The unpacked files, if `root` is an archive.
     unpacked: Option<Arc<archive::Unpacked>>,
     /// Training views, sorted by name; never empty.
     pub train: Vec<View>,
@@ -101,11 +101,10 @@ pub enum Note {
     FarCamerasLeftOut {
         /// Number of cameras.
         count: usize,
-        /// Names of the first of their views.
+        /// Names of the first few of their views.
         names: String,
     },
-    /// There are several COLMAP models, of which the largest is read unless another is
-    /// [chosen](LoadOptions::sparse).
+    /// The largest of several COLMAP models is read, unless another is [chosen](LoadOptions::sparse).
     OtherModels {
         /// The model that is read.
         model: String,
@@ -116,9 +115,9 @@ pub enum Note {
     },
     /// Undistortion crops photographs, unless the [field of view is kept](LoadOptions::keep_fov).
     Cropped {
-        /// Largest share that is lost `[%]`.
+        /// Largest share of a photograph that is lost `[%]`.
         percent: f64,
-        /// Number of photographs.
+        /// Number of photographs that are cropped noticeably.
         photographs: usize,
     },
 }
@@ -196,7 +195,7 @@ impl Dataset {
         }
         if path.is_file() {
             return Err(LoadError::Data(format!(
-                "{}: this file is neither a dataset nor a ZIP archive; name the dataset's folder, or a \
+                "{}: this file is neither a dataset nor a ZIP archive; give the dataset's folder, or a \
                  complete ZIP archive of it (a damaged or incompletely downloaded archive is not recognised)",
                 path.display()
             )));

@@ -1,8 +1,8 @@
 //! Moves scenes to normalised coordinates in f64, so that remote and tiny scenes lose no precision in f32.
 //!
-//! The unit of the scene is the largest distance of a training camera from the mean of all, as in NeRF++ (Zhang et al.
-//! 2020, §4); 3DGS calls 1.1 times that the extent. Rotations stay the same, and with them quaternions and spherical
-//! harmonics.
+//! The unit of the scene is the largest distance of a training camera from the mean of all training cameras, as in
+//! NeRF++ (Zhang et al. 2020, §4); 3DGS calls 1.1 times this distance the extent. Rotations do not change, so
+//! quaternions and spherical harmonics do not either.
 
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
@@ -11,20 +11,20 @@ use crate::models::round_origin;
 use densify_core::camera::Camera;
 use densify_core::gaussians::Gaussians;
 
-/// Extent of every normalised scene `[scene units]`: the factor between the radius of the cameras and the extent (3DGS,
-/// `getNerfppNorm`).
+/// Extent of every normalised scene `[scene units]`: 3DGS defines it as 1.1 times the radius of the cameras
+/// (`getNerfppNorm`).
 pub const EXTENT: f64 = 1.1;
 /// Cameras count as being at one place if their radius is below this fraction of their distance from the origin:
 /// the precision of f64 is 2.2e-16, and poses of other programs have a few digits less.
 const SAME_PLACE: f64 = 1e-12;
 /// Distance from the origin, in radii of the cameras, below which f32 world coordinates are fine enough for all
-/// Gaussians: at 50 their step is at most 4e-6 radii, a fiftieth of the smallest Gaussian made from a point.
+/// Gaussians: at 50 radii, f32 has steps of at most 4e-6 radii, a fiftieth of the smallest Gaussian made from a point.
 const F32_DISTANCE: f64 = 50.0;
 
 /// A camera is an outlier if its distance from the median position exceeds this many times the median of all these
 /// distances. Drone flights and walks around an object stay below 5.
 const OUTLIER_DISTANCE: f64 = 10.0;
-/// If a larger share of the cameras is that far away, these cameras are a part of the scene.
+/// Largest share of the cameras that can be outliers. If more cameras are that far away, they are a part of the scene.
 const MAX_OUTLIERS: f64 = 0.05;
 /// Smallest number of cameras among which outliers can be recognised.
 const MIN_CAMERAS: usize = 10;
@@ -153,8 +153,8 @@ impl Normalisation {
             return model.with_origin(origin);
         }
         for row in 0..model.len() {
-            let place = point(DVec3::from(model.position(row)));
-            model.means[row] = (place - DVec3::from(origin)).as_vec3().to_array();
+            let moved = point(DVec3::from(model.position(row)));
+            model.means[row] = (moved - DVec3::from(origin)).as_vec3().to_array();
         }
         model.origin = origin;
         for value in model.log_scales.as_flattened_mut() {
@@ -163,13 +163,13 @@ impl Normalisation {
         model
     }
 
-    /// True if the scene is so far from the origin that world coordinates in f32 may be too coarse for it.
+    /// Returns true if the scene is so far from the origin that world coordinates in f32 may be too coarse for it.
     pub fn is_remote(&self) -> bool {
         self.centre.length() * self.scale > F32_DISTANCE
     }
 
-    /// A round world point in the middle of the scene, from which local coordinates are measured: near its centre, to
-    /// a power of ten below the radius of the cameras.
+    /// The world point from which local coordinates are measured: the centre of the scene, rounded to a power of ten
+    /// below the radius of the cameras.
     pub fn local_origin(&self) -> [f64; 3] {
         round_origin(self.centre.to_array(), 1.0 / self.scale)
     }
@@ -237,7 +237,7 @@ mod tests {
     }
 
     #[test]
-    fn if_all_cameras_are_at_one_place_the_points_set_the_unit_and_without_points_it_stays() {
+    fn if_all_cameras_coincide_the_points_set_the_unit_if_there_are_any() {
         let centre = DVec3::new(1e6, 0.1, 7.0);
         let points: Vec<_> = [2.0, 4.0, 1000.0].iter().map(|&d| centre + DVec3::Y * d).collect();
         assert!((Normalisation::fit(&[centre; 3], &points).scale - 0.25).abs() < 1e-9);

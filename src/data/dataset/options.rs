@@ -9,8 +9,8 @@ use serde::{Deserialize, Deserializer, Serialize, Serializer};
 /// Options for loading a dataset.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct LoadOptions {
-    /// Folder of the images instead of the one named in the dataset's files, relative to the dataset. Images outside
-    /// the dataset's folder can only be used with this option.
+    /// Folder of the images, relative to the dataset, instead of the one named in its files. Images outside the
+    /// dataset's folder can only be used with this option.
     pub images: Option<PathBuf>,
     /// Folder of the COLMAP model, relative to the dataset; `None`: the model with the most images.
     pub sparse: Option<PathBuf>,

@@ -9,7 +9,7 @@ use unicode_normalization::UnicodeNormalization;
 
 use crate::error::{LoadError, LoadRemedy};
 
-/// Path separators of all systems, as paths may come from another one.
+/// Path separators of all systems, as paths may come from another system.
 const SEPARATORS: [char; 2] = ['/', '\\'];
 /// Longest name accepted from a data file `[bytes]`.
 pub(super) const MAX_NAME: usize = 4096;
@@ -24,7 +24,7 @@ pub(super) struct Root {
     searched: Arc<Mutex<BTreeMap<PathBuf, Names>>>,
 }
 
-/// Entries of a folder with non-ASCII names, by their names in Unicode normalisation form C.
+/// The entries with non-ASCII names in a folder, by their names in Unicode normalisation form C.
 type Names = BTreeMap<String, PathBuf>;
 
 /// A path in a data file, with its location for error messages.
@@ -48,7 +48,7 @@ impl Root {
         &self.shown
     }
 
-    /// Whether another folder is this one or lies in it.
+    /// Returns true if another folder is this one or lies in it.
     pub(super) fn contains(&self, other: &Self) -> bool {
         other.canonical.starts_with(&self.canonical)
     }
@@ -89,7 +89,7 @@ impl Root {
         }
     }
 
-    /// The file whose name is the same in another Unicode spelling: an accent may be a part of its letter or follow it.
+    /// The file with the same name in another Unicode spelling: an accent may be a part of its letter or follow it.
     /// macOS stores file names in one form, and programs mostly list them in the other.
     fn other_spelling(&self, value: &str) -> Option<PathBuf> {
         let mut path = self.shown.clone();
@@ -157,7 +157,7 @@ pub(super) fn is_absolute(value: &str) -> bool {
         || value.starts_with("file:")
 }
 
-/// The problem with the text of a path, if there is one.
+/// The problem that the text of a path shows, if there is one.
 pub(super) fn lexical_fault(value: &str) -> Option<&'static str> {
     if relative(value).is_empty() {
         Some("is empty")

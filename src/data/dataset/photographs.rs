@@ -123,7 +123,7 @@ fn check(listing: &Path, frame: &Frame) -> Result<Checked, LoadError> {
         return Err(LoadError::size(&frame.image, size, expected));
     }
     let lens = lens.resized(header.width, header.height);
-    // The principal point of a crop may lie outside, but hardly by more than the size of the image.
+    // The principal point of a cropped image may lie outside it, but hardly by more than the image's size.
     let extent = lens.size();
     if !(lens.principal.cmpge(-extent) & lens.principal.cmple(2.0 * extent)).all() {
         let DVec2 { x, y } = lens.principal;
@@ -140,7 +140,7 @@ fn turned_note(frames: &[Frame], checked: &[Checked]) -> Option<String> {
     let turned = || frames.iter().zip(checked).filter(|(_, checked)| checked.header.turn.is_some());
     let (first, _) = turned().next()?;
     Some(format!(
-        "turned according to their EXIF, as they lie on their side compared with their cameras: {} (first: {})",
+        "{} rotated by 90 degrees as EXIF says, to match the image sizes of the cameras (first: {})",
         counted(turned().count(), "photograph"),
         first.name
     ))
@@ -151,8 +151,8 @@ fn orientation_note(frames: &[Frame], checked: &[Checked]) -> Option<String> {
     let ambiguous = || frames.iter().zip(checked).filter(|(_, checked)| checked.is_turn_ambiguous);
     let first = &ambiguous().next()?.0.name;
     Some(format!(
-        "used as stored: {} whose EXIF orientation asks for a quarter turn (first: {first}); the pose file states no \
-         image size that would show whether its poses include it. If the model is poor, turn the files themselves",
+        "{} used as stored, although EXIF asks for a rotation by 90 degrees (first: {first}): the pose file states no \
+         image size that would show whether its poses include the rotation. If the model is poor, rotate the files",
         counted(ambiguous().count(), "photograph")
     ))
 }
@@ -175,7 +175,7 @@ fn lens_error(frame: &Frame, lens: &Lens, error: PinholeError) -> LoadError {
     LoadError::malformed(image, origin, problem, remedy)
 }
 
-/// Notes about split and cropped photographs. `all` has the pinholes of each lens and its number of photographs.
+/// Notes about split and cropped photographs. For each lens, `all` has the number of its photographs and its pinholes.
 fn pinhole_notes<'a>(
     all: impl Iterator<Item = (usize, &'a Option<Pinholes>)> + Clone,
     keep_fov: bool,
@@ -216,14 +216,14 @@ fn photograph(
     pinholes: Option<&Pinholes>,
     options: &LoadOptions,
 ) -> Result<Photograph, LoadError> {
-    let file = SourceFile::found(frame.image.clone())?.with_exif(exif);
+    let file = SourceFile::existing(frame.image.clone())?.with_exif(exif);
     let mask = frame.mask.as_ref().map(|mask| {
         let hides = match (mask.hides_all_but_black, options.invert_masks) {
             (false, false) | (true, true) => Hides::Black,
             (false, true) => Hides::White,
             (true, false) => Hides::AllButBlack,
         };
-        let file = SourceFile::found(mask.path.clone())?;
+        let file = SourceFile::existing(mask.path.clone())?;
         Ok::<_, LoadError>(Mask { file, hides, mode: options.mask_mode })
     });
     let mask = mask.transpose()?;
@@ -288,12 +288,12 @@ fn photograph(
 }
 
 /// Checks that a mask has the proportions of its photograph.
-fn check_mask(mask: &Mask, found: ImageHeader, image: ImageHeader) -> Result<(), LoadError> {
-    let (found, size) = ((found.width, found.height), (image.width, image.height));
-    if is_proportional(found, size) {
+fn check_mask(mask: &Mask, header: ImageHeader, image: ImageHeader) -> Result<(), LoadError> {
+    let (size, expected) = ((header.width, header.height), (image.width, image.height));
+    if is_proportional(size, expected) {
         return Ok(());
     }
-    Err(LoadError::size(&mask.file.path, found, size))
+    Err(LoadError::size(&mask.file.path, size, expected))
 }
 
 /// Returns true if a mask hides all of a view; `several` is true if its photograph has more than one view.
@@ -324,7 +324,7 @@ fn face_name(name: &str, face: &str) -> String {
     format!("{}@{face}{}", &name[..dot], &name[dot..])
 }
 
-/// The training resolution of a pinhole image of this size, from a file of this width.
+/// The training resolution of a pinhole image of this size, made from a file that is `file_width` wide.
 pub(super) fn target_size(
     (width, height): (u32, u32),
     file_width: u32,
@@ -344,7 +344,7 @@ pub(super) fn target_size(
     }
 }
 
-/// side / k, rounded as image tools do, at least 1.
+/// side / k, rounded to the nearest integer as image tools do, and at least 1.
 fn divided(side: u32, k: u32) -> u32 {
     ((f64::from(side) / f64::from(k.max(1))).round() as u32).max(1)
 }

@@ -10,7 +10,7 @@ use super::lens::{Lens, Projection};
 /// Accepted fields of view of pinhole cameras `[degrees]`.
 const FIELD_OF_VIEW: std::ops::RangeInclusive<f64> = 0.5..=160.0;
 
-/// Largest accepted field of view of a fisheye, computed without its distortion `[degrees]`. It is large because the
+/// Largest accepted field of view of a fisheye, computed without its distortion `[degrees]`. It exceeds 360 because the
 /// corners of the image may lie outside the image circle.
 const MAX_FISHEYE_FOV: f64 = 720.0;
 /// Largest accepted |ω| of the FOV model `[rad]`; tan(ω/2) is then 20.

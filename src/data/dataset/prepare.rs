@@ -14,7 +14,7 @@ use super::{Dataset, FarCameras, Frame, LoadOptions, Note, PointCloud, Scene, Sp
 use crate::error::{LoadError, LoadRemedy};
 use densify_core::files::one_line;
 
-/// Largest fraction of unusable points.
+/// Largest accepted fraction of unusable points.
 const MAX_BAD_POINTS: f64 = 0.01;
 
 /// Checks the frames that the reader of a format returned, and assembles the dataset.
@@ -63,7 +63,7 @@ pub(super) fn assemble(
     };
     let mut view_list = options.views.as_deref().map(ViewList::read).transpose()?;
     // Indices of the training views of a photograph, by its id in tracks.
-    let mut numbers_of = HashMap::new();
+    let mut views_by_id = HashMap::new();
     let (mut train, mut test) = (Vec::<View>::new(), Vec::new());
     let mut hidden_names = Vec::new();
     // Centres of the training cameras that are not outliers.
@@ -84,7 +84,7 @@ pub(super) fn assemble(
             test.extend(views);
         } else {
             let first = train.len() as u32;
-            numbers_of.extend(id.map(|id| (id, first..first + views.len() as u32)));
+            views_by_id.extend(id.map(|id| (id, first..first + views.len() as u32)));
             near.extend((!is_far[index]).then(|| centres[index]));
             train.extend(views);
         }
@@ -112,7 +112,7 @@ pub(super) fn assemble(
         return Err(LoadError::Remedied { problem, remedy: LoadRemedy::LargerTestEvery });
     }
     let points_path = points_file.as_deref().unwrap_or(path);
-    drop_bad(points_path, &mut points, &mut notes, "finite", DVec3::is_finite)?;
+    drop_points(points_path, &mut points, &mut notes, "finite", DVec3::is_finite)?;
     let normalisation = Normalisation::fit(&near, &points.positions);
     for view in train.iter_mut().chain(&mut test) {
         view.camera = normalisation.scene_from_world_camera(&view.camera);
@@ -124,15 +124,15 @@ pub(super) fn assemble(
     for position in &mut points.positions {
         *position = normalisation.scene_from_world(*position);
     }
-    drop_bad(points_path, &mut points, &mut notes, "within the range of f32", |p| {
+    drop_points(points_path, &mut points, &mut notes, "within the range of f32", |p| {
         p.as_vec3().is_finite()
     })?;
-    // Of several views of a photograph, a track is assigned to the one that shows its point.
+    // If a photograph has several views, a track is assigned to the first view that shows its point.
     let shows = |number: u32, point: DVec3| {
         train[number as usize].camera.depth_in_image(point, 0.0).is_some()
     };
     let tracks = tracks.in_training_views(&normalisation, |id, point| {
-        let mut numbers = numbers_of.get(&id)?.clone();
+        let mut numbers = views_by_id.get(&id)?.clone();
         if numbers.len() == 1 { numbers.next() } else { numbers.find(|&view| shows(view, point)) }
     });
     let root = path.to_owned();
@@ -185,8 +185,8 @@ fn refuse_duplicates(listing: &Path, frames: &[Frame]) -> Result<(), LoadError> 
     Ok(())
 }
 
-/// Drops the points that `keep` refuses, and notes their number.
-fn drop_bad(
+/// Drops the points that `keep` refuses, and notes their number; too many are an error.
+fn drop_points(
     path: &Path,
     points: &mut PointCloud,
     notes: &mut Vec<Note>,

@@ -3,10 +3,10 @@
 //! Each line is a photograph: `#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2`, angles in degrees.
 //! RealityScan 2 calls some columns `yaw`, `f_35mm`, `px_norm` and `py_norm`. With all angles 0 a camera looks straight
 //! down and the top of its image is north (+y); heading turns it clockwise about the vertical, pitch raises its view
-//! towards the horizon, roll tilts it (Capturing Reality, *Registration export and camera orientations*). `f` is the
-//! focal length for an image whose longer side is 36 mm; `px` and `py` are the offset of the principal point from the
-//! centre, in units of the longer side. The distortion is Brown's: k1 to k4 of r² to r⁸; t1 and t2 are OpenCV's p2 and
-//! p1, the order in which RealityCapture's own OpenCV export writes them.
+//! towards the horizon, roll tilts it sideways (Capturing Reality, *Registration export and camera orientations*). `f`
+//! is the focal length for an image whose longer side is 36 mm; `px` and `py` are the offset of the principal point
+//! from the centre, in units of the longer side. The distortion is Brown's: k1 to k4 of r² to r⁸; t1 and t2 are
+//! OpenCV's p2 and p1, the order in which RealityCapture's own OpenCV export writes them.
 //!
 //! The table is parsed here rather than by a CSV crate: the export writes plain commas and decimal points whatever the
 //! system's language, and names without quotes. Quotes are accepted nevertheless.
@@ -36,13 +36,13 @@ pub(super) const FORMAT: DatasetFormat = DatasetFormat {
     read,
 };
 
-/// Largest file read `[bytes]`; a photograph takes about 200.
+/// Largest file read `[bytes]`; each photograph takes about 200 bytes.
 const MAX_BYTES: u64 = 256 << 20;
 /// Maximum number of CSV files that are examined in the dataset's folder.
 const MAX_CANDIDATES: usize = 64;
 const MAX_FRAMES: usize = 1_000_000;
 const REMEDY: &str = "export \"Internal/External camera parameters\" again";
-/// Film width that focal lengths refer to `[mm]`.
+/// Film width for which focal lengths are stated `[mm]`.
 const FILM: f64 = 36.0;
 /// Required columns, which identify the table.
 const NEEDED: [&str; 8] = ["name", "x", "y", "alt", "heading", "pitch", "roll", "f"];
@@ -59,32 +59,32 @@ const DISTORTION: [(&str, Term); 6] = [
 const RENAMED: [(&str, &str); 4] =
     [("yaw", "heading"), ("f_35mm", "f"), ("px_norm", "px"), ("py_norm", "py")];
 
-/// The table in the dataset's folder, if there is one, whatever its name.
+/// The table in the dataset's folder, whatever its name, if there is one.
 ///
 /// # Errors
-/// When there are several, as they may belong to different scenes.
-fn find(root: &Root) -> Result<Option<PathBuf>, LoadError> {
+/// When there are several tables, as they may belong to different scenes.
+fn find_table(root: &Root) -> Result<Option<PathBuf>, LoadError> {
     let is_csv = |name: &str| name.to_ascii_lowercase().ends_with(".csv");
     let entries = fs::read_dir(root.path()).into_iter().flatten().flatten();
     let names = entries.filter_map(|entry| entry.file_name().into_string().ok());
     let mut names: Vec<String> = names.filter(|name| is_csv(name)).collect();
     names.sort();
-    let mut found = Vec::new();
+    let mut tables = Vec::new();
     for name in names.iter().take(MAX_CANDIDATES) {
         let path = root.path().join(name);
         let Ok(text) = files::read_text(&path, MAX_BYTES) else { continue };
         if text.lines().take(3).any(|line| Columns::parse(line).is_some()) {
             root.existing(DataPath { file: &path, field: "the file", value: name })?;
-            found.push(path);
+            tables.push(path);
         }
     }
-    if found.len() > 1 {
-        let [first, second] = [0, 1].map(|i| found[i].display());
+    if tables.len() > 1 {
+        let [first, second] = [0, 1].map(|i| tables[i].display());
         return Err(LoadError::Data(format!(
             "{first} and {second} both list cameras; leave only the one that belongs to the photographs"
         )));
     }
-    Ok(found.pop())
+    Ok(tables.pop())
 }
 
 /// Reads the table in a folder, if there is one. Photographs are looked for in `images/`, then in the dataset's folder.
@@ -92,11 +92,11 @@ fn find(root: &Root) -> Result<Option<PathBuf>, LoadError> {
 /// # Errors
 /// When a line is damaged or a camera is impossible.
 fn read(root: &Root, options: &LoadOptions) -> Result<Option<Scene>, LoadError> {
-    let Some(path) = &find(root)? else { return Ok(None) };
+    let Some(path) = &find_table(root)? else { return Ok(None) };
     let fault =
         |place: &str, problem: &str| Err(LoadError::malformed(path, place, problem, REMEDY));
-    let [first, second] = [true, false].map(|within| Folders::new(root, options, within));
-    let (first, second) = (first?, second?);
+    let [in_images, in_root] = [true, false].map(|within| Folders::new(root, options, within));
+    let (in_images, in_root) = (in_images?, in_root?);
     let text = files::read_text(path, MAX_BYTES).map_err(LoadError::io(path))?;
     let mut lines = (1..).zip(text.lines()).filter(|(_, line)| !line.trim().is_empty());
     let Some(columns) = lines.find_map(|(_, line)| Columns::parse(line)) else {
@@ -112,15 +112,15 @@ fn read(root: &Root, options: &LoadOptions) -> Result<Option<Scene>, LoadError> 
         let name = row.text("name").trim();
         let field = format!("line {number}: name");
         let named = DataPath { file: path, field: &field, value: name };
-        let (folders, found) = match first.image(named)? {
-            Some(found) => (&first, found),
+        let (folders, found) = match in_images.image(named)? {
+            Some(found) => (&in_images, found),
             None => {
-                let Some(found) = second.image(named)? else {
-                    first_missing.get_or_insert_with(|| first.first_path(named));
+                let Some(found) = in_root.image(named)? else {
+                    first_missing.get_or_insert_with(|| in_images.first_path(named));
                     missing.push(name.to_owned());
                     continue;
                 };
-                (&second, found)
+                (&in_root, found)
             }
         };
         fell_back += usize::from(found.fell_back);
@@ -152,7 +152,7 @@ fn read(root: &Root, options: &LoadOptions) -> Result<Option<Scene>, LoadError> 
         ));
     }
     if fell_back > 0 {
-        notes.push(first.fell_back_note(fell_back));
+        notes.push(in_images.fell_back_note(fell_back));
     }
     let points_file = usual_points(root, path, &mut notes)?;
     let points = points_file.as_deref().map(crate::points::read_points).transpose()?;
@@ -206,7 +206,7 @@ impl Row<'_> {
         at.and_then(|at| self.cells.get(at)).map_or("", String::as_str)
     }
 
-    /// A number; 0 if an optional column is missing or empty.
+    /// The number in a column; 0 if the column is optional and is missing or empty.
     fn number(&self, column: &str) -> Result<f64, LoadError> {
         let text = self.text(column).trim();
         if text.is_empty() && !NEEDED.contains(&column) {
@@ -218,7 +218,7 @@ impl Row<'_> {
         })
     }
 
-    /// camera_from_world with OpenCV axes.
+    /// The pose `camera_from_world`, with OpenCV axes.
     fn pose(&self, frame: &str) -> Result<(DMat3, DVec3), LoadError> {
         let angle = |column| self.number(column).map(f64::to_radians);
         let (heading, pitch, roll) = (angle("heading")?, angle("pitch")?, angle("roll")?);
@@ -226,7 +226,7 @@ impl Row<'_> {
         let world_from_camera = DMat3::from_rotation_z(-heading)
             * DMat3::from_rotation_x(pitch)
             * DMat3::from_rotation_y(roll)
-            // The camera that looks straight down: right is east, down is south.
+            // The axes of the camera that looks straight down: right is east, down is south.
             * DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0));
         let (rotation, centre) =
             checked_pose(self.path, frame, world_from_camera.transpose(), centre)?;

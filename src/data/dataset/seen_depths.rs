@@ -11,7 +11,7 @@ use densify_core::camera::Camera;
 
 /// Cells along each side of a picture.
 const CELLS: usize = 16;
-/// Maximum number of cameras that are used, equally spaced in their list: the depths then take 1 MiB.
+/// Maximum number of cameras that are used, at equal intervals in their list: the depths then take 1 MiB.
 const MAX_CAMERAS: usize = 1 << 10;
 /// Maximum number of pairs of a camera and a point that are used; they take one thread a fifth of a second.
 const MAX_PAIRS: usize = 1 << 24;
@@ -21,7 +21,7 @@ const MAX_PAIRS: usize = 1 << 24;
 pub struct SeenDepths(Vec<f32>);
 
 impl SeenDepths {
-    /// Measures the depths of points before cameras in the same coordinates.
+    /// Measures the depths at which cameras see points, in the same coordinates.
     pub fn measure(points: &[DVec3], cameras: &[Camera]) -> Self {
         let cameras: Vec<&Camera> =
             cameras.iter().step_by(stride(cameras.len(), MAX_CAMERAS)).collect();
@@ -43,22 +43,22 @@ impl SeenDepths {
         Self(depths)
     }
 
-    /// The depth below which this share of the cells that show a point lies; `None` if no camera sees a point.
+    /// The depth below which this share of the measured depths lies; `None` if no camera sees a point.
     pub fn quantile(&self, share: f64) -> Option<f64> {
-        let place = (share * self.0.len() as f64) as usize;
-        self.0.get(place).map(|&depth| f64::from(depth))
+        let index = (share * self.0.len() as f64) as usize;
+        self.0.get(index).map(|&depth| f64::from(depth))
     }
 
-    /// The share of the cells that show a point whose depth is below `depth`.
+    /// The share of the measured depths that are below `depth`.
     pub fn share_below(&self, depth: f64) -> f64 {
         let count = self.0.partition_point(|&seen| f64::from(seen) < depth);
         count as f64 / self.0.len().max(1) as f64
     }
 }
 
-/// The distance between the values that are used, so that at most `most` of `values` are.
-fn stride(values: usize, most: usize) -> usize {
-    values.div_ceil(most.max(1)).max(1)
+/// The stride at which at most `limit` of `count` values are used.
+fn stride(count: usize, limit: usize) -> usize {
+    count.div_ceil(limit.max(1)).max(1)
 }
 
 /// The cell of the picture that contains a pixel.

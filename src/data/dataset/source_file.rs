@@ -27,7 +27,7 @@ impl SourceFile {
     ///
     /// # Errors
     /// When the file no longer exists.
-    pub(super) fn found(path: PathBuf) -> Result<Self, LoadError> {
+    pub(super) fn existing(path: PathBuf) -> Result<Self, LoadError> {
         let real = path.canonicalize().map_err(LoadError::io(&path))?;
         Ok(Self { path, real: real.into(), archive: None, exif: None })
     }
@@ -37,12 +37,12 @@ impl SourceFile {
         Self { path, real: Path::new("").into(), archive: None, exif: Some(Box::default()) }
     }
 
-    /// Keeps EXIF fields that have been read already.
+    /// Stores EXIF fields that have already been read.
     pub(super) fn with_exif(self, exif: Option<Exif>) -> Self {
         Self { exif: exif.map(Box::new), ..self }
     }
 
-    /// The same file as a part of an archive, whose name messages show.
+    /// The same file as a part of an archive, whose name messages then show.
     pub(super) fn in_archive(self, archive: &Arc<Unpacked>) -> Self {
         Self {
             path: archive.path_in_archive(&self.path),

@@ -7,7 +7,7 @@ use glam::DVec3;
 
 use super::normalise::Normalisation;
 
-/// Number of tracks that remain after thinning. At twice this number the tracks are thinned to half.
+/// Number of tracks that remain after thinning. At twice this number, every second track is dropped.
 const THINNED_TRACKS: usize = 1 << 15;
 /// Largest number of views kept per track.
 pub(super) const MAX_VIEWS: u64 = 64;
@@ -87,7 +87,7 @@ impl TrackSampler {
         (self.seen - 1).is_multiple_of(self.stride)
     }
 
-    /// Adds a track with the ids of its photographs, of which [`MAX_VIEWS`] are kept.
+    /// Adds a track with the ids of its photographs; only the first [`MAX_VIEWS`] are kept.
     pub(super) fn add(
         &mut self,
         position: DVec3,
@@ -111,10 +111,10 @@ impl TrackSampler {
 }
 
 fn keep_every_second<T>(values: &mut Vec<T>) {
-    let mut place = 0;
+    let mut index = 0;
     values.retain(|_| {
-        place += 1;
-        place % 2 == 1
+        index += 1;
+        index % 2 == 1
     });
 }
 

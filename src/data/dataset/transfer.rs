@@ -1,6 +1,6 @@
-//! The transfer function that a PNG states, such as that of linear values, and the conversion to sRGB.
+//! The transfer function that a PNG states, such as a linear one, and the conversion to sRGB.
 //!
-//! If several chunks state it, `cICP` takes precedence over `iCCP`, `sRGB` and `gAMA` (PNG, 3rd edition, 4.3).
+//! If several chunks state one, `cICP` takes precedence over `iCCP`, `sRGB` and `gAMA` (PNG, 3rd edition, 4.3).
 
 use std::io::{BufRead, Read, Seek};
 
@@ -10,7 +10,7 @@ use image::{DynamicImage, ImageBuffer, Pixel};
 const SIGNATURE: [u8; 8] = *b"\x89PNG\r\n\x1a\n";
 /// Code of linear values in `cICP` (ITU-T H.273, table 3).
 const LINEAR: u8 = 8;
-/// Codes and names of the values of high dynamic range.
+/// Codes and names of the transfer functions of high dynamic range.
 const HIGH_RANGE: [(u8, &str); 2] = [(16, "PQ"), (18, "HLG")];
 /// The exponent in `gAMA` that programs write for sRGB.
 const SRGB: f64 = 1.0 / 2.2;
@@ -20,15 +20,15 @@ const TOLERANCE: f64 = 0.05;
 /// The transfer function of a PNG's values.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Transfer {
-    /// The values are light to the power of this exponent.
+    /// The values are linear light to the power of this exponent.
     Exponent(f64),
     /// High dynamic range with this name.
     HighRange(&'static str),
 }
 
-/// The exponent of a PNG's values, which are light to the power of the exponent; `None` if they are sRGB or in doubt.
+/// The exponent to which a PNG's values raise linear light; `None` if the values are, or may be, sRGB.
 pub(super) fn exponent(input: impl BufRead + Seek) -> Option<f64> {
-    match stated(input)? {
+    match stated_transfer(input)? {
         Transfer::Exponent(exponent) => Some(exponent),
         Transfer::HighRange(_) => None,
     }
@@ -37,14 +37,14 @@ pub(super) fn exponent(input: impl BufRead + Seek) -> Option<f64> {
 /// The name of the transfer function if the values have a high dynamic range; converting them to sRGB would need tone
 /// mapping.
 pub(super) fn high_range(input: impl BufRead + Seek) -> Option<&'static str> {
-    match stated(input)? {
+    match stated_transfer(input)? {
         Transfer::HighRange(name) => Some(name),
         Transfer::Exponent(_) => None,
     }
 }
 
-/// The transfer function that a PNG states, unless it is that of sRGB or in doubt.
-fn stated(mut input: impl BufRead + Seek) -> Option<Transfer> {
+/// The transfer function that a PNG states; `None` if it is, or may be, that of sRGB.
+fn stated_transfer(mut input: impl BufRead + Seek) -> Option<Transfer> {
     let bytes = |input: &mut dyn Read| {
         let mut bytes = [0; 8];
         input.read_exact(&mut bytes).ok().map(|()| bytes)
@@ -52,7 +52,7 @@ fn stated(mut input: impl BufRead + Seek) -> Option<Transfer> {
     if bytes(&mut input)? != SIGNATURE {
         return None;
     }
-    let (mut gamma, mut is_known) = (None, false);
+    let (mut gamma, mut ignores_gamma) = (None, false);
     loop {
         let [a, b, c, d, kind @ ..] = bytes(&mut input)?;
         let mut rest = i64::from(u32::from_be_bytes([a, b, c, d])) + 4;
@@ -67,17 +67,17 @@ fn stated(mut input: impl BufRead + Seek) -> Option<Transfer> {
                 gamma = Some(f64::from(u32::from_be_bytes([a, b, c, d])) / 1e5);
                 rest = 0;
             }
-            b"iCCP" | b"sRGB" => is_known = true,
+            b"iCCP" | b"sRGB" => ignores_gamma = true,
             b"IDAT" | b"IEND" => break,
             _ => {}
         }
         input.seek_relative(rest).ok()?;
     }
     let is_other = |exponent: &f64| *exponent > 0.0 && (exponent / SRGB - 1.0).abs() > TOLERANCE;
-    gamma.filter(|exponent| !is_known && is_other(exponent)).map(Transfer::Exponent)
+    gamma.filter(|exponent| !ignores_gamma && is_other(exponent)).map(Transfer::Exponent)
 }
 
-/// Converts values that are light to the power of `exponent` to sRGB.
+/// Converts values that are linear light to the power of `exponent` to sRGB.
 pub(super) fn to_srgb(image: &mut DynamicImage, exponent: f64) {
     use DynamicImage::*;
     let srgb = |value: f64| srgb_from_linear(value.powf(1.0 / exponent));
@@ -95,12 +95,12 @@ pub(super) fn to_srgb(image: &mut DynamicImage, exponent: f64) {
         ImageLumaA16(image) => replace(image, &deep()),
         ImageRgb16(image) => replace(image, &deep()),
         ImageRgba16(image) => replace(image, &deep()),
-        // No PNG has other values.
+        // PNGs have no other types of pixels.
         _ => {}
     }
 }
 
-/// Replaces all values but alpha by those of a table.
+/// Replaces all values but alpha with those of a table.
 fn replace<P: Pixel>(image: &mut ImageBuffer<P, Vec<P::Subpixel>>, table: &[P::Subpixel])
 where
     P::Subpixel: Into<usize>,

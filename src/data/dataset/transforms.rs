@@ -24,7 +24,7 @@ use super::pose::{check_lens, checked_pose};
 use super::prepare::text_notes;
 use super::{Frame, LoadError, LoadOptions, Note, Scene, Split, colmap};
 
-/// The pair of files that defines its own test split.
+/// The format with a pair of files, which defines its own test split.
 pub(super) const SPLIT_FORMAT: DatasetFormat = DatasetFormat {
     name: "nerf-synthetic",
     title: "NeRF-synthetic",
@@ -32,7 +32,7 @@ pub(super) const SPLIT_FORMAT: DatasetFormat = DatasetFormat {
     files: "transforms_train.json and transforms_test.json",
     read: read_pair,
 };
-/// The single file.
+/// The format with the single file `transforms.json`.
 pub(super) const FORMAT: DatasetFormat = DatasetFormat {
     name: "transforms",
     title: "nerfstudio or instant-ngp",
@@ -244,7 +244,7 @@ pub(super) fn usual_points(
 /// The fields of one frame, with those at the top level as defaults.
 struct Fields<'a> {
     path: &'a Path,
-    /// The frame, as prefix of field names in messages.
+    /// Prefix of field names in messages that names the frame, such as `frames[3].`; empty at the top level.
     place: String,
     frame: Option<&'a Map<String, Value>>,
     top: &'a Map<String, Value>,
@@ -272,7 +272,7 @@ impl<'a> Fields<'a> {
         }
     }
 
-    /// Reads the lists that the file has.
+    /// Reads the lists of frames in the file.
     fn frame_lists(&self, folders: &Folders, lists: &mut FrameLists) -> Result<(), LoadError> {
         for (list, field) in frame_lists::FIELDS.into_iter().enumerate() {
             let Some(value) = self.own(field) else { continue };
@@ -342,7 +342,7 @@ impl<'a> Fields<'a> {
         Err(self.fault(field, format!("{value} px is not an image size")))
     }
 
-    /// camera_from_world with OpenCV axes.
+    /// The pose `camera_from_world`, with OpenCV axes.
     fn pose(&self, file: &str) -> Result<(DMat3, DVec3), LoadError> {
         const FIELD: &str = "transform_matrix";
         let shape = || self.fault(FIELD, "it is not a matrix of 3 or 4 rows of 4 numbers");
@@ -357,7 +357,7 @@ impl<'a> Fields<'a> {
                 *entry = value.as_f64().ok_or_else(shape)?;
             }
         }
-        // In OpenCV y and z point the opposite way.
+        // In OpenCV, y and z point the opposite way.
         let column = |j: usize| DVec3::new(m[0][j], m[1][j], m[2][j]);
         let world_from_camera = DMat3::from_cols(column(0), -column(1), -column(2));
         let frame = format!("{} ({file})", self.full(FIELD));
@@ -371,7 +371,8 @@ impl<'a> Fields<'a> {
         Ok(self.side("w")?.zip(self.side("h")?))
     }
 
-    /// The lens at the size stated in the file, else at the size of the image, whose header is then returned as well.
+    /// The lens at the image size stated in the file. If none is stated, the lens has the size of the image, whose
+    /// header is then returned as well.
     fn lens(
         &self,
         image: &Path,

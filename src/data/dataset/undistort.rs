@@ -43,7 +43,7 @@ impl Undistortion {
         ray.z > 0.0 && (at.cmpge(DVec2::splat(-1e-6)) & at.cmple(size + 1e-6)).all()
     }
 
-    /// Position in the lens's image of a point in the pinhole's `[px]`; `None` if the lens did not see it.
+    /// Position in the lens's image of a point in the pinhole's image `[px]`; `None` if the lens did not see the point.
     pub(super) fn source_of(&self, pixel: DVec2) -> Option<DVec2> {
         let p = (pixel - self.to.principal) / self.to.focal;
         let ray = self.lens_from_pinhole * p.extend(1.0);

@@ -33,7 +33,7 @@ pub(super) struct ViewList {
 struct Entry {
     /// Line number, from 1.
     line: usize,
-    /// The part of the view that is used, if not all.
+    /// The part of the view that is used; `None`: the whole view.
     part: Option<Part>,
     /// True if the dataset has a view of this name.
     exists: bool,

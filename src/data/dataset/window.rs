@@ -58,7 +58,8 @@ impl Part {
     }
 }
 
-/// First pixel and number of pixels of a span, widened to [`MIN_SIDE`] pixels if the image has as many.
+/// First pixel and number of pixels of a span, widened to [`MIN_SIDE`] pixels or, in a smaller image, to the whole
+/// side.
 fn span(from: f64, to: f64, size: u32) -> [u32; 2] {
     let (from, to) = (from * f64::from(size), to * f64::from(size));
     let least = f64::from(MIN_SIDE.min(size));
@@ -102,7 +103,7 @@ mod tests {
         let part = |left, right| Part { left, right, top: 0.25, bottom: 0.75 };
         let window = |left, right| part(left, right).window(200, 100);
         assert_eq!(window(0.5, 0.9), Some(Window { x: 100, y: 25, width: 80, height: 50 }));
-        // Too narrow: widened evenly, or inwards at a border.
+        // Parts that are too narrow are widened evenly, or inwards at a border.
         assert_eq!(window(0.5, 0.52), Some(Window { x: 86, y: 25, width: 32, height: 50 }));
         assert_eq!(window(0.0, 0.01).map(|window| (window.x, window.width)), Some((0, 32)));
         assert_eq!(window(0.99, 1.0).map(|window| (window.x, window.width)), Some((168, 32)));

@@ -1,5 +1,5 @@
-//! Measures how much a quantised format changes a model, by reading the file back. This finds changes of every cause: a
-//! limited range, a step that is too coarse, a codebook that an outlier spoils.
+//! Measures how much a quantised format changes a model, by reading the file back. This finds changes whatever their
+//! cause: a limited range, a step that is too coarse, a codebook that an outlier spoils.
 
 use std::fmt;
 
@@ -16,9 +16,9 @@ const QUANTITIES: [(&str, &str, f64); 4] = [
     ("opacities", "by more than 10 %", 0.1),
     ("colours", "by more than 10 % of white", 0.1),
 ];
-/// Share of the visible area, estimated by [`weight`], from which on changes are noted.
+/// Smallest changed share of the visible area, estimated by [`weight`], that is noted.
 const NOTED: f64 = 0.01;
-/// Share of the visible area from which on a format is unfit for the model.
+/// Smallest changed share of the visible area that makes a format unfit for the model.
 const UNFIT: f64 = 0.25;
 /// Directions in which colours are compared; a band has at most seven coefficients.
 const DIRECTIONS: usize = 8;
@@ -33,21 +33,21 @@ pub struct Changes {
 }
 
 impl Changes {
-    /// Compares the model with `found`, which was read back from its file and has the model's rows in this `order`.
-    pub(super) fn measure(model: &Gaussians, order: &[usize], found: &Gaussians) -> Self {
+    /// Compares the model with `saved`, which was read back from its file and holds the model's rows in `order`.
+    pub(super) fn measure(model: &Gaussians, order: &[usize], saved: &Gaussians) -> Self {
         let mut changes = Self::default();
-        if found.len() < model.len() {
+        if saved.len() < model.len() {
             // The missing Gaussians were not finite when read back.
-            (changes.by_quantity[0], changes.share) = ((model.len() - found.len(), 1.0), 1.0);
+            (changes.by_quantity[0], changes.share) = ((model.len() - saved.len(), 1.0), 1.0);
             return changes;
         }
         let (axes, bases) = (middles_and_spreads(model), bases(model.sh_degree));
         let mut total = f64::MIN_POSITIVE;
-        for (place, &row) in order.iter().enumerate() {
+        for (index, &row) in order.iter().enumerate() {
             let weight = weight(model, row, &axes);
             total += weight;
             let mut is_changed = false;
-            let row_changes = row_changes(model, row, found, place, &bases);
+            let row_changes = row_changes(model, row, saved, index, &bases);
             for (at, (change, (.., limit))) in row_changes.into_iter().zip(QUANTITIES).enumerate() {
                 // The change is NaN if both values are infinite.
                 if change > limit || change.is_nan() {
@@ -92,22 +92,22 @@ impl fmt::Display for Changes {
 fn row_changes(
     model: &Gaussians,
     row: usize,
-    found: &Gaussians,
-    place: usize,
+    saved: &Gaussians,
+    index: usize,
     bases: &[[f32; 16]],
 ) -> [f64; 4] {
-    let [old, new] = [&model.log_scales[row], &found.log_scales[place]].map(|logs| logs.map(size));
+    let [old, new] = [&model.log_scales[row], &saved.log_scales[index]].map(|logs| logs.map(size));
     // The thinnest axis of a flat Gaussian is visible only from its edge, so the middle axis sets the scale.
     let middle = sorted(old)[1];
     let shift = (0..3).map(|axis| {
-        let [a, b] = [&model.means[row], &found.means[place]].map(|mean| f64::from(mean[axis]));
+        let [a, b] = [&model.means[row], &saved.means[index]].map(|mean| f64::from(mean[axis]));
         (a - b).powi(2)
     });
     let scale = (0..3).map(|axis| (new[axis] - old[axis]).abs() / old[axis].max(middle));
-    let [was, is] = [model.opacity_logits[row], found.opacity_logits[place]]
+    let [was, is] = [model.opacity_logits[row], saved.opacity_logits[index]]
         .map(|logit| f64::from(sigmoid(logit)));
     let colour = bases.iter().map(|basis| {
-        let [a, b] = [model.sh_of(row), found.sh_of(place)].map(|sh| colour(sh, basis));
+        let [a, b] = [model.sh_of(row), saved.sh_of(index)].map(|sh| colour(sh, basis));
         (0..3).map(|channel| f64::from(a[channel] - b[channel]).powi(2)).sum::<f64>()
     });
     [
@@ -119,7 +119,7 @@ fn row_changes(
 }
 
 /// An estimate of the share of an image that a Gaussian covers, times its opacity. Its distance from the cameras is
-/// estimated from its distance from the model's middle and from the model's spread.
+/// estimated from its distance to the model's middle and the model's spread.
 fn weight(model: &Gaussians, row: usize, axes: &[(f64, f64); 3]) -> f64 {
     let [_, middle, largest] = sorted(model.log_scales[row].map(size));
     let squares = model.means[row]
@@ -140,7 +140,7 @@ fn sorted(mut sizes: [f64; 3]) -> [f64; 3] {
     sizes
 }
 
-/// The basis functions of colour in directions on a spiral.
+/// The values of the spherical harmonics in directions on a spiral.
 fn bases(sh_degree: u8) -> Vec<[f32; 16]> {
     let basis = |point: usize| {
         let z = 1.0 - (2 * point + 1) as f32 / DIRECTIONS as f32;
@@ -153,7 +153,7 @@ fn bases(sh_degree: u8) -> Vec<[f32; 16]> {
     (0..if sh_degree == 0 { 1 } else { DIRECTIONS }).map(basis).collect()
 }
 
-/// The colour that is shown in a direction.
+/// The colour of a Gaussian in a direction, given the values of the spherical harmonics there.
 fn colour(sh: &[f32], basis: &[f32; 16]) -> [f32; 3] {
     let mut sum = [0.5f32; 3];
     for (coefficients, y) in sh.as_chunks::<3>().0.iter().zip(basis) {

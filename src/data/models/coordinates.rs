@@ -56,15 +56,15 @@ pub fn offset_text(offset: [f64; 3]) -> String {
     offset.map(|value| value.to_string()).join(" ")
 }
 
-/// Error of a rounded position above which the position counts as coarse (root mean square) `[Gaussian's size]`. A
-/// tenth changes a pixel by less than a twentieth of the Gaussian's contrast.
+/// Error of a rounded position above which the position counts as coarse (root mean square) `[Gaussian's size]`. An
+/// error of a tenth changes a pixel by less than a twentieth of the Gaussian's contrast.
 const COARSE: f64 = 0.1;
-/// Error above which a position counts as lost: a half, as in [`super::Changes`].
+/// Error above which a position counts as lost `[Gaussian's size]`: a half, as for [`super::Changes`].
 const LOST: f64 = 0.5;
-/// Share of the visible area, estimated as in [`Coarseness::add`], from which on coarse coordinates are avoided, or the
-/// user is told.
+/// Smallest coarse share of the visible area, estimated as in [`Coarseness::add`], at which world coordinates in f32
+/// are avoided or the user is told.
 const NOTED: f64 = 0.01;
-/// Share of the visible area from which on lost positions make a file unfit.
+/// Smallest share of the visible area with lost positions that makes a file unfit.
 const UNFIT: f64 = 0.25;
 
 /// A model is remote, so that f32 may be too coarse, if its middle is farther from the origin than this many times its
@@ -89,9 +89,9 @@ impl Coarseness {
     /// Measures a whole model.
     pub fn measure(model: &Gaussians) -> Self {
         let (middle, spread) = middle_and_largest_spread(model);
-        let mut found = Self::default();
-        found.add(model, middle.to_array(), spread);
-        found
+        let mut coarseness = Self::default();
+        coarseness.add(model, middle.to_array(), spread);
+        coarseness
     }
 
     /// Adds rows of a scene with this middle and extent `[world units]`, from which a Gaussian's distance from the
@@ -192,7 +192,7 @@ pub fn local_origin(model: &Gaussians) -> [f64; 3] {
     round_origin(middle.to_array(), spread)
 }
 
-/// A point near the middle of these coordinates, by axis, if they are so far from 0 that f32 may be too coarse; else 0.
+/// A point near the middle of coordinates, by axis, that are so far from 0 that f32 may be too coarse; otherwise 0.
 pub(super) fn remote_origin(axes: [Vec<f64>; 3]) -> [f64; 3] {
     let is_exact = |value: &f64| f64::from(*value as f32).to_bits() == value.to_bits();
     if axes.iter().flatten().all(is_exact) {
@@ -203,7 +203,7 @@ pub(super) fn remote_origin(axes: [Vec<f64>; 3]) -> [f64; 3] {
     if is_remote(middle, spread) { round_origin(middle, spread) } else { [0.0; 3] }
 }
 
-/// A point rounded to the power of ten below `unit`, at most 1e15; a number that is not finite becomes 0.
+/// A point rounded to the power of ten below `unit` (1e-15 to 1e15); a number that is not finite becomes 0.
 pub fn round_origin(point: [f64; 3], unit: f64) -> [f64; 3] {
     let exponent = unit.log10().floor().clamp(-15.0, 15.0) as i32;
     let step = 10f64.powi(exponent.abs());
@@ -243,7 +243,7 @@ mod tests {
         }
     }
 
-    /// What counts is the size of the visible Gaussians, not the extent.
+    /// The size of the visible Gaussians counts, not the extent of the model.
     #[test]
     fn only_visible_gaussians_make_coordinates_coarse() {
         let mut model = Gaussians::zeros(100, 0);

@@ -3,7 +3,7 @@
 
 use densify_core::gaussians::logit;
 
-/// Log-scale of a flat Gaussian, finite in place of −∞; compressed PLY uses the same value.
+/// Finite log-scale in place of −∞, that of a flat Gaussian; compressed PLY uses the same value.
 pub(super) const FLAT: f32 = -20.0;
 /// Largest magnitude of a log-scale in quantised formats: an infinite log-scale would leave no resolution for the
 /// others.

@@ -20,7 +20,7 @@ const MAX_JSON: u64 = 1 << 30;
 /// The functions that recognise and read a format's files.
 #[derive(Debug, Clone, Copy)]
 pub struct Reader {
-    /// Decides from a file's content whether it has this format.
+    /// Judges from a file's content whether it has this format.
     pub recognise: fn(&ModelFile<'_>) -> Result<Match, LoadError>,
     /// Reads a file that was recognised.
     pub read: fn(ModelFile<'_>) -> Result<SplatFile, LoadError>,
@@ -122,7 +122,7 @@ pub fn read_model(path: &Path) -> Result<SplatFile, LoadError> {
             Match::None => {}
         }
     }
-    let mut found = match best {
+    let mut model = match best {
         Some(reader) => (reader.read)(file)?,
         None if file.json()?.is_some_and(|text| text.contains("\"lodLevels\"")) => {
             return Err(LoadError::Data(format!(
@@ -132,8 +132,8 @@ pub fn read_model(path: &Path) -> Result<SplatFile, LoadError> {
         }
         None => return Err(unrecognised(path)),
     };
-    sidecar::apply(path, &mut found)?;
-    Ok(found)
+    sidecar::apply(path, &mut model)?;
+    Ok(model)
 }
 
 /// The main file of a folder that is a model; `None` if the folder is not one.

@@ -16,9 +16,9 @@ const ZERO_QUATERNION: f32 = 1e-12;
 pub struct SplatFile {
     /// The Gaussians, in the file's order and coordinates; bit for bit where the format stores f32.
     pub gaussians: Gaussians,
-    /// Gaussians dropped because a value was not finite.
+    /// Number of Gaussians dropped because a value was not finite.
     pub dropped: usize,
-    /// Gaussians whose zero quaternion was replaced with the identity.
+    /// Number of Gaussians whose zero quaternion was replaced with the identity.
     pub repaired: usize,
     /// Notes for the user, one sentence each, on how the file was interpreted and what was ignored.
     pub notes: Vec<String>,

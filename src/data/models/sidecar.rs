@@ -14,10 +14,10 @@ use super::SplatFile;
 use crate::error::LoadError;
 use densify_core::files::{self, FileError, write_atomically};
 
-/// What is appended to the name of the model's file.
-const ENDING: &str = ".offset.json";
+/// Suffix that is appended to the name of the model's file.
+const SUFFIX: &str = ".offset.json";
 /// Largest sidecar `[bytes]`.
-const MOST_BYTES: u64 = 1 << 16;
+const MAX_BYTES: u64 = 1 << 16;
 
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -29,7 +29,7 @@ struct Sidecar {
 /// The sidecar of a model's file.
 pub fn sidecar_path(model: &Path) -> PathBuf {
     let mut name = model.as_os_str().to_owned();
-    name.push(ENDING);
+    name.push(SUFFIX);
     name.into()
 }
 
@@ -39,7 +39,7 @@ pub fn sidecar_path(model: &Path) -> PathBuf {
 /// When it is damaged, belongs to another file, or contradicts the offset in the model's file.
 pub(super) fn apply(path: &Path, file: &mut SplatFile) -> Result<(), LoadError> {
     let sidecar = sidecar_path(path);
-    let text = match files::read_text(&sidecar, MOST_BYTES) {
+    let text = match files::read_text(&sidecar, MAX_BYTES) {
         Err(error) if is_absent(&error) => return Ok(()),
         text => text.map_err(LoadError::io(&sidecar))?,
     };

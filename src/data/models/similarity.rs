@@ -49,12 +49,12 @@ impl Similarity {
             model.origin = (DVec3::from(model.origin) + translation).to_array();
             return;
         }
-        let place = |point: DVec3| scale * (rotation * point) + translation;
+        let apply = |point: DVec3| scale * (rotation * point) + translation;
         let (middle, spread) = middle_and_largest_spread(model);
-        let is_far = is_remote(place(middle).to_array(), scale * spread);
-        let origin = if is_far { place(DVec3::from(model.origin)) } else { DVec3::ZERO };
+        let is_far = is_remote(apply(middle).to_array(), scale * spread);
+        let origin = if is_far { apply(DVec3::from(model.origin)) } else { DVec3::ZERO };
         for row in 0..model.len() {
-            let moved = place(DVec3::from(model.position(row))) - origin;
+            let moved = apply(DVec3::from(model.position(row))) - origin;
             model.means[row] = moved.as_vec3().to_array();
         }
         model.origin = origin.to_array();
@@ -155,7 +155,7 @@ mod tests {
     use super::*;
     use crate::models::tests::model;
 
-    /// Colour of a Gaussian from a direction.
+    /// Colour of a Gaussian in a direction.
     fn shown(model: &Gaussians, row: usize, d: DVec3) -> [f64; 3] {
         let mut y = [0f32; 16];
         y[0] = sh::C0;

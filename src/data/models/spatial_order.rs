@@ -25,12 +25,12 @@ pub(super) fn middle_and_spread(mut values: Vec<f64>) -> (f64, f64) {
 /// The rows of a model in the order of the curve, which is scaled by the model's spread along each axis.
 pub(super) fn spatial_order(model: &Gaussians) -> Vec<usize> {
     let axes = middles_and_spreads(model);
-    let place = |row: usize| {
+    let code = |row: usize| {
         let mean = model.means[row].map(f64::from);
         morton_code(std::array::from_fn(|i| (mean[i] - axes[i].0) / (2.0 * axes[i].1)))
     };
     let mut rows: Vec<usize> = (0..model.len()).collect();
-    rows.sort_by_cached_key(|&row| (place(row), row));
+    rows.sort_by_cached_key(|&row| (code(row), row));
     rows
 }
 

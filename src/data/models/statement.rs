@@ -1,4 +1,4 @@
-//! What files state about a model's antialiasing beside its Gaussians.
+//! What files state about a model's antialiasing, in addition to its Gaussians.
 //!
 //! | file | statement |
 //! |---|---|
@@ -40,7 +40,7 @@ pub(super) fn stated_in_comments(
     path: &Path,
     comments: &[String],
 ) -> Result<(Antialiasing, Option<String>), LoadError> {
-    let (mut own, mut said) = (None, None);
+    let (mut own, mut other) = (None, None);
     let is_of_brush = comments.iter().any(|line| line.starts_with("Exported from Brush"));
     for comment in comments {
         let lower = comment.to_lowercase();
@@ -49,12 +49,12 @@ pub(super) fn stated_in_comments(
             [KERNEL, kernel] => {
                 own = Some(parse_kernel(path, &format!("comment {comment:?}"), kernel)?);
             }
-            ["splatrendermode:", mode] => said = Some((mode == "mip", comment)),
-            ["antialiased", number] => said = Some((number == "1", comment)),
+            ["splatrendermode:", mode] => other = Some((mode == "mip", comment)),
+            ["antialiased", number] => other = Some((number == "1", comment)),
             _ => {}
         }
     }
-    Ok(match (own, said) {
+    Ok(match (own, other) {
         (Some(own), _) => (own, None),
         (None, Some((true, comment))) => {
             let kind = if is_of_brush { Antialiasing::Narrow } else { Antialiasing::Wide };

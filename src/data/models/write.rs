@@ -21,7 +21,7 @@ pub struct Shape {
     pub rows: usize,
     /// Spherical-harmonic degree, 0..=3.
     pub sh_degree: u8,
-    /// Antialiasing.
+    /// Antialiasing with which the model was trained.
     pub antialiasing: Antialiasing,
     /// Frame of the coordinates.
     pub frame: Frame,
@@ -37,8 +37,8 @@ impl From<&Gaussians> for Shape {
 /// Writes one model to one file: [`begin`](Self::begin), then [`rows`](Self::rows) for each piece
 /// in order, then [`finish`](Self::finish).
 pub trait ModelWriter {
-    /// Upper bound on the memory that the writer takes beside the piece it is given `[bytes]`. It is part
-    /// of a run's memory ledger, so it must hold for every model of this shape.
+    /// Upper bound on the memory that the writer takes in addition to the piece it is given `[bytes]`. It is part of a
+    /// run's memory ledger, so it must hold for every model of this shape.
     fn held_bytes(&self, shape: Shape) -> u64;
 
     /// True if the format packs consecutive Gaussians together, so that they should be neighbours in space. The file
@@ -180,7 +180,7 @@ impl Format {
         writer.finish(out)
     }
 
-    /// The changes to `model` in the file that [`write`](Self::write) has made of it; none if the format is exact.
+    /// The changes to `model` in the file that [`write`](Self::write) made of it; none if the format is exact.
     ///
     /// # Errors
     /// When the file cannot be read.
@@ -235,8 +235,8 @@ impl Format {
     }
 
     /// Writes a model to a file that appears only when it is complete, with its sidecar if it needs one. `rows` is
-    /// asked for one piece after the other, as a second copy of the model may not fit into memory; each has the origin
-    /// of the frame.
+    /// asked for one piece after the other, as a second copy of the model may not fit into memory; each piece has the
+    /// origin of the frame.
     ///
     /// # Errors
     /// Those of `rows`, [`ModelWriter`] and [`write_checked`].

@@ -13,7 +13,7 @@ use super::write::unfit;
 use crate::error::LoadError;
 use densify_core::files::max_unpacked_bytes;
 
-/// The date of all files, 1 January 1980 in MS-DOS format: equal models give equal files.
+/// The date of all files, 1 January 1980 in MS-DOS format. It is fixed, so that equal models give equal files.
 const DATE: u16 = 1 << 5 | 1;
 /// Version 2.0, which every reader supports.
 const VERSION: u16 = 20;

@@ -12,7 +12,7 @@ use densify_core::files;
 /// Longest number accepted in an ascii file `[bytes]`.
 const MAX_WORD: usize = 128;
 
-/// A PLY file with its header read.
+/// A PLY file whose header has been read.
 pub(crate) struct Ply<'a> {
     path: &'a Path,
     input: BufReader<File>,
@@ -46,7 +46,7 @@ impl<'a> Ply<'a> {
 
     /// The three numbers after `prefix` in a comment; `None` without such a comment. Several such comments must agree.
     pub(crate) fn comment_numbers(&self, prefix: &str) -> Result<Option<[f64; 3]>, LoadError> {
-        let mut found = None;
+        let mut prior = None;
         let texts = self.header.comments.iter().filter_map(|comment| comment.strip_prefix(prefix));
         for text in texts.filter(|text| text.starts_with(' ')) {
             let wrong = |problem: String| {
@@ -59,20 +59,20 @@ impl<'a> Ply<'a> {
             let numbers = numbers.filter(|n| count == 3 && n.iter().all(|value| value.is_finite()));
             let numbers =
                 numbers.ok_or_else(|| wrong(format!("{:?} is not three numbers", text.trim())))?;
-            if let Some(other) = found
+            if let Some(other) = prior
                 .filter(|other: &[f64; 3]| other.map(f64::to_bits) != numbers.map(f64::to_bits))
             {
                 return Err(wrong(format!("{numbers:?} contradicts the {other:?} before it")));
             }
-            found = Some(numbers);
+            prior = Some(numbers);
         }
-        Ok(found)
+        Ok(prior)
     }
 
     /// The element with this name.
     pub(crate) fn element(&self, name: &str) -> Result<Element, LoadError> {
-        let found = self.header.elements.iter().find(|element| element.name == name).cloned();
-        found.ok_or_else(|| {
+        let element = self.header.elements.iter().find(|element| element.name == name).cloned();
+        element.ok_or_else(|| {
             LoadError::damaged(self.path, "header", format!("there is no element {name:?}"))
         })
     }

@@ -28,7 +28,7 @@ pub(super) struct Observation {
 /// Peak memory for reading and measuring the colours of tracks, in addition to an image `[bytes]`.
 pub fn bytes(tracks: &Tracks) -> u64 {
     let colours: usize = tracks.views.iter().map(Vec::len).sum();
-    // The observations, and two differences per channel of each, of which medians are taken.
+    // The observations and, for each, two differences per channel, whose medians are taken.
     (colours * (size_of::<Observation>() + 6 * size_of::<f32>())) as u64
 }
 
@@ -107,8 +107,8 @@ impl TrackColours {
     }
 
     /// The fitted colour of a track, by its index among the tracks with enough views.
-    pub(super) fn reference(&self, place: usize) -> [f32; 3] {
-        self.fits.each_ref().map(|fit| fit.references[place])
+    pub(super) fn reference(&self, index: usize) -> [f32; 3] {
+        self.fits.each_ref().map(|fit| fit.references[index])
     }
 }
 
@@ -140,13 +140,13 @@ fn neighbourhood(image: &Image8, pixel: glam::DVec2) -> Option<([u8; 3], [u8; 3]
     }
     let (mut lowest, mut highest) = ([u8::MAX; 3], [u8::MIN; 3]);
     let at = |x: i64, y: i64| (y * width + x) as usize;
-    for place in (y - 1..=y + 1).flat_map(|y| (x - 1..=x + 1).map(move |x| at(x, y))) {
-        let whole = |plane: &Option<Vec<u8>>| plane.as_ref().is_none_or(|p| p[place] == u8::MAX);
+    for index in (y - 1..=y + 1).flat_map(|y| (x - 1..=x + 1).map(move |x| at(x, y))) {
+        let whole = |plane: &Option<Vec<u8>>| plane.as_ref().is_none_or(|p| p[index] == u8::MAX);
         if !whole(&image.alpha) || !whole(&image.mask) {
             return None;
         }
         for channel in 0..3 {
-            let value = image.rgb[3 * place + channel];
+            let value = image.rgb[3 * index + channel];
             lowest[channel] = lowest[channel].min(value);
             highest[channel] = highest[channel].max(value);
         }

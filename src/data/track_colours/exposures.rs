@@ -67,15 +67,15 @@ impl ExposureSpread {
         let differences = 3 * colours.by_track().map(<[_]>::len).sum::<usize>();
         let mut alike = Vec::with_capacity(differences);
         let mut with_gains = Vec::with_capacity(differences);
-        let mut own = Vec::new();
+        let mut values = Vec::new();
         let mut tracks = 0;
-        for (place, seen) in colours.by_track().enumerate() {
+        for (index, seen) in colours.by_track().enumerate() {
             tracks += 1;
-            let fitted = colours.reference(place);
+            let fitted = colours.reference(index);
             for (channel, fitted) in fitted.iter().enumerate() {
-                own.clear();
-                own.extend(seen.iter().map(|colour| f32::from(colour.centre[channel])));
-                let plain = median(&mut own);
+                values.clear();
+                values.extend(seen.iter().map(|colour| f32::from(colour.centre[channel])));
+                let plain = median(&mut values);
                 for colour in seen.iter().filter(|colour| colours.knows(colour.view as usize)) {
                     let value = f32::from(colour.centre[channel]);
                     let gain = colours.gains(colour.view as usize)[channel];

@@ -6,8 +6,8 @@
 //! of differences are excluded:
 //!
 //! - Reconstructed points lie on edges and corners, where the colour changes more within a pixel than by any highlight.
-//!   So the difference is the distance of the track's colour (the median over its views) from the range of *all*
-//!   colours within a pixel.
+//!   The difference in a view is therefore the distance of the track's colour (the median over its views) from the
+//!   range of *all* colours within a pixel.
 //! - The point may be occluded in some views. The quarter of its views that differ most is ignored.
 //! - The point may not lie on a surface. A point counts as on a surface if most views show the colour that the
 //!   reconstruction gives it; if fewer than half of all points do, no decision is made.
@@ -29,7 +29,7 @@ pub use colours::{TrackColours, bytes};
 
 /// Smallest number of measured tracks for a decision.
 pub const MIN_TRACKS: usize = 500;
-/// The 95th percentiles from which on degrees 1, 2 and 3 are chosen `[1/255]`, fitted to the scenes of
+/// The smallest 95th percentiles for which degrees 1, 2 and 3 are chosen `[1/255]`, fitted to the scenes of
 /// `docs/studies/sh-degree-auto.tsv`.
 const THRESHOLDS: [f64; 3] = [1.0, 2.0, 3.0];
 /// Largest difference between a point's colour in the reconstruction and in a view, if the point lies on a surface
@@ -67,7 +67,7 @@ impl Spread {
 /// Measures how much the colours of tracks change with the view, after correcting exposures.
 pub fn measure(tracks: &Tracks, colours: &TrackColours) -> Spread {
     let (mut each, mut on_surface, mut buffer) = (Vec::new(), 0, Vec::new());
-    for (place, seen) in colours.by_track().enumerate() {
+    for (index, seen) in colours.by_track().enumerate() {
         let Some(first) = seen.first() else { continue };
         let own = tracks.colours[first.track as usize].map(f32::from);
         let mut differences = |from: [f32; 3]| -> Vec<f64> {
@@ -80,15 +80,15 @@ pub fn measure(tracks: &Tracks, colours: &TrackColours) -> Spread {
         };
         let to_own = differences(own);
         on_surface += usize::from(to_own[(to_own.len() - 1) / 2] < SAME_COLOUR * SAME_COLOUR);
-        let to_reference = differences(colours.reference(place));
+        let to_reference = differences(colours.reference(index));
         let counted = ((to_reference.len() as f64 * AGREEING).round() as usize).max(1);
         let sum: f64 = to_reference.iter().take(counted).sum();
         each.push((sum / counted as f64).sqrt());
     }
     each.sort_unstable_by(f64::total_cmp);
     let percentile = |fraction: f64| {
-        let place = (fraction * each.len().saturating_sub(1) as f64).round() as usize;
-        each.get(place).copied().unwrap_or(0.0)
+        let index = (fraction * each.len().saturating_sub(1) as f64).round() as usize;
+        each.get(index).copied().unwrap_or(0.0)
     };
     let tracks = each.len().max(1) as f64;
     Spread {

@@ -137,14 +137,14 @@ impl Model<'_> {
     }
 
     fn set_opacity(&mut self, row: usize, rule: OpacityRule, siblings: u32) {
-        let was = self.params.get(row, plane::OPACITY);
-        let opacity = sigmoid(was);
+        let old = self.params.get(row, plane::OPACITY);
+        let opacity = sigmoid(old);
         let logit = match rule {
-            OpacityRule::Same => was,
+            OpacityRule::Same => old,
             OpacityRule::Set(o) => logit(o),
             OpacityRule::Scaled(factor) => logit(opacity * factor),
-            // 1 − o from the logit, so that it does not round to 0.
-            OpacityRule::Conserved => logit(1.0 - sigmoid(-was).powf(1.0 / siblings.max(1) as f32)),
+            // 1 − o is computed from the logit, so that it does not round to 0.
+            OpacityRule::Conserved => logit(1.0 - sigmoid(-old).powf(1.0 / siblings.max(1) as f32)),
         };
         self.params.set(row, plane::OPACITY, logit);
     }
@@ -166,14 +166,14 @@ impl Model<'_> {
             if decay.seen_only && !was_seen {
                 continue;
             }
-            let was = self.params.get(row, plane::OPACITY);
+            let old = self.params.get(row, plane::OPACITY);
             // Non-finite numbers are left to the audit, and a decay of 0 must leave every bit unchanged.
-            if decay.opacity > 0.0 && was.is_finite() {
-                let opacity = sigmoid(was);
+            if decay.opacity > 0.0 && old.is_finite() {
+                let opacity = sigmoid(old);
                 let decayed = (opacity - decay.opacity).max(MIN_DECAYED_OPACITY);
-                // 1 − o from the logit, so that nothing cancels.
-                let transparency = sigmoid(-was) + (opacity - decayed);
-                self.params.set(row, plane::OPACITY, was.min((decayed / transparency).ln()));
+                // 1 − o is computed from the logit, so that nothing cancels.
+                let transparency = sigmoid(-old) + (opacity - decayed);
+                self.params.set(row, plane::OPACITY, old.min((decayed / transparency).ln()));
             }
             if decay.scale > 0.0 {
                 let scales = self.params.get_n::<3>(row, plane::LOG_SCALE).map(|x| x + shrunk);
@@ -182,7 +182,7 @@ impl Model<'_> {
         }
     }
 
-    /// Resets moments, age, signals and summed gradients.
+    /// Resets a row's moments, age, signals and summed gradients.
     fn reset_row(&mut self, row: usize) {
         self.masks.reset_moments(row);
         self.edit_training_state(RowEdit::Clear(row));

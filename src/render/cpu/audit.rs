@@ -19,8 +19,8 @@ impl CpuBackend {
                 let array = ModelArray::of_parameter(number);
                 Some(NonFinite { row: row as u32, array, kind })
             };
-            let moment = |which: usize| {
-                let of_row = |plane| self.moments.get(row, plane)[which];
+            let moment = |order: usize| {
+                let of_row = |plane| self.moments.get(row, plane)[order];
                 (row >= self.moments.first()).then(|| first(&of_row, NumberKind::Moment))?
             };
             first(&|plane| self.params.get(row, plane), NumberKind::Parameter)
@@ -44,8 +44,8 @@ impl CpuBackend {
             suspects.flat_map(|b| b * WIDTH..rows.min((b + 1) * WIDTH)).filter_map(find).collect()
         };
         let tasks = 0..blocks.div_ceil(BLOCKS_PER_TASK);
-        let found = self.threads.install(|| self.threads.collect("audit", tasks, of_task));
-        found.into_iter().flatten().collect()
+        let by_task = self.threads.install(|| self.threads.collect("audit", tasks, of_task));
+        by_task.into_iter().flatten().collect()
     }
 }
 

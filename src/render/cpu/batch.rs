@@ -44,7 +44,7 @@ pub(super) struct Batch {
     /// u and z of the patches' corners, per splat.
     corner_u: [[f32; PATCHES]; BATCH],
     corner_z: [[f32; PATCHES]; BATCH],
-    /// For each patch a bit per splat: whether the splat may be blended into one of its pixels.
+    /// For each patch a bit per splat: whether the splat may be blended into one of the patch's pixels.
     pub(super) splats_of: [u32; PATCHES],
     /// The same information as a bit per patch, for each splat.
     pub(super) patches_of: [u32; BATCH],
@@ -107,7 +107,7 @@ impl Batch {
         }
     }
 
-    /// Removes splat `end` and all later ones from patch `p`.
+    /// Removes splat `end` and all later splats from patch `p`.
     #[inline(always)]
     pub(super) fn cut(&mut self, p: usize, end: usize) {
         if end < BATCH {

@@ -89,23 +89,23 @@ impl<T: Copy + Default> Blocks<T> {
         self.planes * WIDTH
     }
 
-    /// Numbers in the blocks of the rows before `rows`.
+    /// Numbers in the blocks of the rows before row `rows`.
     fn numbers(&self, rows: usize) -> usize {
         rows.saturating_sub(self.first).div_ceil(WIDTH) * self.stride()
     }
 
-    /// The blocks of the rows before `rows`.
+    /// The blocks of the rows before row `rows`.
     pub(super) fn of_rows_mut(&mut self, rows: usize) -> &mut [T] {
         let numbers = self.numbers(rows);
         &mut self.data[..numbers]
     }
 
-    /// A read-only view of the blocks of the rows before `rows`.
+    /// A read-only view of the blocks of the rows before row `rows`.
     pub(super) fn view(&self, rows: usize) -> BlockView<'_, T> {
         BlockView { stride: self.stride(), data: &self.data[..self.numbers(rows)] }
     }
 
-    /// The blocks of the rows before `rows`, split for the optimiser's tasks.
+    /// The blocks of the rows before row `rows`, split for the optimiser's tasks.
     pub(super) fn tasks(
         &mut self,
         rows: usize,
@@ -245,9 +245,9 @@ mod tests {
         for length in [1, 6, 7, 63, 64] {
             let mut numbers: Vec<usize> = (0..length).collect();
             let chunks: Vec<Vec<usize>> = numbers.chunks(7).map(<[_]>::to_vec).collect();
-            let found: Vec<Vec<usize>> =
+            let parts: Vec<Vec<usize>> =
                 parts(&mut numbers, 7, chunks.len()).map(|part| part.to_vec()).collect();
-            assert_eq!(found, chunks);
+            assert_eq!(parts, chunks);
         }
         let nothing: &mut [u8] = &mut [];
         let lengths: Vec<usize> = parts(nothing, 0, 5).map(|part| part.len()).collect();

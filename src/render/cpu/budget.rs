@@ -45,7 +45,7 @@ pub(super) fn trained(options: &Setup) -> Range<usize> {
     frozen.min(total) / ROWS_PER_TASK * ROWS_PER_TASK..total
 }
 
-/// Number of rows in the buffer of summed records, frozen ones included.
+/// Number of rows in the buffer of summed records, including frozen rows.
 pub(super) fn summed_rows(options: &Setup) -> usize {
     if options.only_renders { 0 } else { options.row_budget().total.next_multiple_of(WIDTH) }
 }
@@ -183,7 +183,7 @@ mod tests {
             sh: vec![0.5, 0.1, -0.4, -0.2, 0.9, 0.3],
         };
         let camera = Camera::centred((40, 30), (30.0, 30.0), DMat3::IDENTITY, DVec3::ZERO);
-        let made = [false, true].map(|only_renders| {
+        let results = [false, true].map(|only_renders| {
             let options = Setup { only_renders, threads: Some(1), ..Setup::new(2) };
             let mut backend = CpuBackend::new(&model, &options).unwrap();
             let bytes = backend.moments.allocated_bytes() as usize
@@ -192,9 +192,9 @@ mod tests {
                 + size_of_val(&backend.records[..]);
             (bytes, backend.ledger.total(), backend.render(&camera, [0.1; 3], 0).unwrap())
         });
-        let [(trains, planned, expected), (bytes, less, found)] = made;
-        assert!(bytes < 64 && trains - bytes == (planned - less) as usize, "{bytes} of {trains}");
-        assert!(found == expected);
+        let [(total, planned, expected), (bytes, less, rendering)] = results;
+        assert!(bytes < 64 && total - bytes == (planned - less) as usize, "{bytes} of {total}");
+        assert!(rendering == expected);
     }
 
     /// Budgets around 2³¹ and 2³² rows, and one beyond what a slot number can address.

@@ -42,25 +42,25 @@ pub(super) fn rank(
     let mut part = LINES * width.max(1);
     let tasks = ranking.par_chunks_mut(part).enumerate();
     let mut kept = threads.collect("rank", tasks, |(task, ranking)| {
-        let mut found = 0;
+        let mut ranked = 0;
         for at in 0..ranking.len() {
             let (x, y) = (at % width, task * LINES + at / width);
             if let Some(error) = error(x, y).filter(|&error| error > 0.0) {
-                ranking[found] = (error, (y * width + x) as u32);
-                found += 1;
+                ranking[ranked] = (error, (y * width + x) as u32);
+                ranked += 1;
             }
         }
-        keep_worst(&mut ranking[..found], count)
+        keep_worst(&mut ranking[..ranked], count)
     });
     while kept.len() > 1 {
         let tasks = ranking.par_chunks_mut(LISTS * part).zip(kept.par_chunks(LISTS));
         kept = threads.collect("rank", tasks, |(ranking, kept)| {
-            let mut found = 0;
+            let mut ranked = 0;
             for (i, &kept) in kept.iter().enumerate() {
-                ranking.copy_within(i * part..i * part + kept, found);
-                found += kept;
+                ranking.copy_within(i * part..i * part + kept, ranked);
+                ranked += kept;
             }
-            keep_worst(&mut ranking[..found], count)
+            keep_worst(&mut ranking[..ranked], count)
         });
         part *= LISTS;
     }
@@ -76,7 +76,7 @@ pub(super) fn surface_row(
     shortcuts: Shortcuts,
     mode: DepthMode,
 ) -> Option<usize> {
-    let mut light = 1.0_f32;
+    let mut transmittance = 1.0_f32;
     let mut best = None;
     let mut most = 0.0;
     for entry in list {
@@ -89,14 +89,14 @@ pub(super) fn surface_row(
         if alpha.is_nan() || alpha < shortcuts.alpha_min {
             continue;
         }
-        let weight = alpha * light;
-        light -= weight;
+        let weight = alpha * transmittance;
+        transmittance -= weight;
         match mode {
             DepthMode::MaxWeight if weight > most => (most, best) = (weight, Some(row)),
-            DepthMode::Median if light < 0.5 => return Some(row),
+            DepthMode::Median if transmittance < 0.5 => return Some(row),
             _ => {}
         }
-        if light <= shortcuts.transmittance_min {
+        if transmittance <= shortcuts.transmittance_min {
             break;
         }
     }
@@ -154,11 +154,11 @@ mod tests {
                 (hash != 5).then_some(hash as f32 - 10.0)
             };
             for (count, spaced) in [(1, true), (3, false), (40, true), (9999, false)] {
-                let [mut all, mut some] = [(); 2].map(|()| Candidates::new(Some(request)));
+                let [mut complete, mut merged] = [(); 2].map(|()| Candidates::new(Some(request)));
                 let rank = |ranking: &mut Vec<_>, most| rank(&threads, ranking, size, most, error);
-                let expected = all.worst(size[0], size[1], count, spaced, error);
+                let expected = complete.worst(size[0], size[1], count, spaced, error);
                 assert!(!expected.is_empty());
-                assert_eq!(some.worst_by(size, count, spaced, rank, error), expected);
+                assert_eq!(merged.worst_by(size, count, spaced, rank, error), expected);
             }
         }
     }

@@ -2,7 +2,7 @@
 
 use super::loss::ErrorRequests;
 use super::optimise::Differentiate;
-use super::rasterize::{DARK, DepthPlane};
+use super::rasterize::{DepthPlane, ZERO_PLANE};
 use super::tiles::Grid;
 use super::{CpuBackend, ModelGradient, for_each_pixel, scalars};
 use crate::signals::RecordLayout;
@@ -26,7 +26,7 @@ impl Differentiable for CpuBackend {
         let frame = self.forward(camera, background, sh_degree, DepthPlane::Depth, None)?;
         let rendering = self.rendering(&frame);
         for (tile, gradient) in self.gradient[..frame.grid.tiles()].iter_mut().enumerate() {
-            gradient.planes = [DARK; 5];
+            gradient.planes = [ZERO_PLANE; 5];
             for_each_pixel(&frame.grid, tile, |patch, lane, at| {
                 for channel in 0..3 {
                     gradient.planes[channel][patch][lane] = upstream.rgb[3 * at + channel];

@@ -116,7 +116,7 @@ impl WithSimd for ExposeBwd<'_> {
             for (p, inside) in inside.iter().enumerate() {
                 for lane in 0..WIDTH {
                     let colour: [f32; 3] = std::array::from_fn(|c| canvas.planes[c][p][lane]);
-                    let light = canvas.planes[TRANSMITTANCE][p][lane];
+                    let transmittance = canvas.planes[TRANSMITTANCE][p][lane];
                     let g: [f32; 3] =
                         std::array::from_fn(|c| gradient.planes[c][p][lane] * inside[lane]);
                     for i in 0..3 {
@@ -124,7 +124,7 @@ impl WithSimd for ExposeBwd<'_> {
                             sums[3 * i + j][lane] += g[i] * colour[j];
                         }
                         sums[9 + i][lane] += g[i];
-                        sums[12 + i][lane] += g[i] * light;
+                        sums[12 + i][lane] += g[i] * transmittance;
                         gradient.planes[i][p][lane] =
                             from_red[i] * g[0] + from_green[i] * g[1] + from_blue[i] * g[2];
                     }

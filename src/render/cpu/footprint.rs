@@ -215,13 +215,13 @@ impl<S: Simd> Ellipse<S> {
     }
 }
 
-/// The index of the tile that contains a bound, given relative to the first pixel centre.
+/// The index of the tile that contains a bound, clamped to `tiles`; `x` is relative to the first pixel centre `[px]`.
 ///
 /// Rounds down by adding 2²³, above which f32 has only whole numbers.
 #[inline(always)]
-fn tile_of<S: Simd>(x: V<S>, most: usize) -> V<S> {
+fn tile_of<S: Simd>(x: V<S>, tiles: usize) -> V<S> {
     let c = |number| V::splat_like(x, number);
-    let x = (x * (1.0 / TILE as f32)).max(c(0.0)).min(c((most - 1) as f32));
+    let x = (x * (1.0 / TILE as f32)).max(c(0.0)).min(c((tiles - 1) as f32));
     let nearest = (x + 8_388_608.0) - 8_388_608.0;
     x.lt(nearest).select(nearest - 1.0, nearest)
 }
@@ -236,7 +236,7 @@ mod tests {
     use super::super::simd::WIDTH;
     use super::*;
 
-    /// Bits of sixteen splats.
+    /// Computes the footprint bits of sixteen splats.
     struct Tiles<'a>(&'a [Splat], &'a Grid);
 
     impl WithSimd for Tiles<'_> {

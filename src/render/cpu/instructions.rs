@@ -7,7 +7,7 @@ use pulp::Arch;
 /// Instruction sets of the native backend's kernels.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum InstructionSet {
-    /// The best that the machine supports.
+    /// The widest vectors that the machine supports.
     #[default]
     Best,
     /// No vectors.
@@ -19,10 +19,10 @@ pub enum InstructionSet {
 impl InstructionSet {
     /// The sets that differ on this machine, the simplest first.
     pub fn available() -> Vec<Self> {
-        let mut all = vec![Self::Best, Self::Avx2, Self::Scalar];
-        all.dedup_by_key(|set| set.lanes());
-        all.reverse();
-        all
+        let mut sets = vec![Self::Best, Self::Avx2, Self::Scalar];
+        sets.dedup_by_key(|set| set.lanes());
+        sets.reverse();
+        sets
     }
 
     pub(super) fn arch(self) -> Arch {

@@ -74,7 +74,7 @@ impl Masks {
         }
     }
 
-    /// Resets the moments.
+    /// Resets the moments of a row's mask.
     pub(super) fn reset_moments(&mut self, row: usize) {
         if self.is_declared() {
             self.blocks.set(row, FIRST, 0.0);
@@ -99,8 +99,8 @@ impl Masks {
 }
 
 impl MaskTask<'_> {
-    /// Takes an Adam step of the masks of a block, from the gradient of the image loss; `ages` are
-    /// those before the step. A row whose mask falls to the threshold becomes transparent.
+    /// Takes an Adam step for the masks of a block, from the gradient of the image loss; `ages` are the rows' ages
+    /// before the step. A row whose mask falls to the threshold becomes transparent.
     pub(super) fn step(
         &mut self,
         block: usize,

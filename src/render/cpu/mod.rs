@@ -195,8 +195,8 @@ impl CpuBackend {
         })
     }
 
-    /// Starts recording the durations of the tasks of training steps; on one thread only, as several would slow each
-    /// other down.
+    /// Starts recording the durations of the tasks of training steps. Tasks are recorded on one thread only, because
+    /// several threads would slow each other down.
     ///
     /// # Panics
     /// When the backend has more than one thread.
@@ -222,7 +222,7 @@ impl CpuBackend {
         let for_rows = self.signals.layout().has(Field::Error).then_some(self.signals.planes.score);
         let errors = ErrorRequests { for_candidates: weights, for_rows };
         let value = self.image_loss(&frame.grid, target, background, errors);
-        let by_exposure =
+        let exposure_gradient =
             exposure.map(|exposure| self.exposure_bwd(&frame.grid, exposure, background));
         if let Some((request, count)) = picks {
             let photograph = Photograph { target, background, exposure };
@@ -235,7 +235,7 @@ impl CpuBackend {
             visible: frame.visible,
             entries: frame.entries,
             bands: frame.bands.len() as u32,
-            exposure: by_exposure,
+            exposure: exposure_gradient,
             ..scalars(value)
         })
     }
@@ -277,7 +277,7 @@ impl Backend for CpuBackend {
     }
 
     fn take_signals(&mut self, wanted: SignalSet) -> Result<Signals, BackendError> {
-        // The memory of the sums is unused between steps.
+        // The memory of the summed records is unused between steps.
         let memory = std::mem::take(&mut self.sums);
         let mut signals = Signals::zeros_in(memory, self.rows, wanted);
         let of_rows = (&self.params, &self.masks, &self.ages);

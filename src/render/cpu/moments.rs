@@ -116,20 +116,20 @@ impl Moments {
         })
     }
 
-    /// The first (0) or second (1) moments of some rows as they are stored: f32, or ratios in
-    /// two's complement and codes of [`F8`]. Shape: `[rows.len(), planes]`.
+    /// The first (`moment` 0) or second (1) moments of some rows as they are stored: f32, or ratios in two's complement
+    /// and codes of [`F8`]. Shape: `[rows.len(), planes]`.
     pub(super) fn tensor(
         &self,
-        which: usize,
+        moment: usize,
         name: &str,
         rows: Range<usize>,
         planes: usize,
     ) -> Tensor {
         let (shape, planes) = ([rows.len(), planes], 0..planes);
         if !self.is_narrow() {
-            return Tensor::f32(name, &shape, self.wide[which].to_rows(rows, planes));
+            return Tensor::f32(name, &shape, self.wide[moment].to_rows(rows, planes));
         }
-        let codes = if which == 0 {
+        let codes = if moment == 0 {
             self.ratios.to_rows(rows, planes).into_iter().map(i8::cast_unsigned).collect()
         } else {
             self.seconds.to_rows(rows, planes).into_iter().map(|code| code.0).collect()
@@ -140,18 +140,18 @@ impl Moments {
     /// Restores an array that [`tensor`](Self::tensor) returned.
     pub(super) fn restore(
         &mut self,
-        which: usize,
+        moment: usize,
         rows: Range<usize>,
         planes: usize,
         tensor: Tensor,
     ) -> Result<(), StateError> {
         let (shape, planes) = ([rows.len(), planes], 0..planes);
         if !self.is_narrow() {
-            self.wide[which].set_rows(rows, planes, &tensor.into_f32(&shape)?);
+            self.wide[moment].set_rows(rows, planes, &tensor.into_f32(&shape)?);
             return Ok(());
         }
         let codes = tensor.into_u8(&shape)?.into_iter();
-        if which == 0 {
+        if moment == 0 {
             let ratios: Vec<i8> = codes.map(u8::cast_signed).collect();
             self.ratios.set_rows(rows, planes, &ratios);
         } else {
@@ -226,15 +226,15 @@ impl MomentTask<'_> {
         block: usize,
         planes: usize,
         [m, v]: &[Scratch; 2],
-        [of_m, of_v]: [&mut Draws; 2],
+        [m_draws, v_draws]: [&mut Draws; 2],
     ) {
         if !self.is_narrow {
             return;
         }
         let used = planes * WIDTH;
         let second = &mut self.seconds.block(block)[..used];
-        narrow(&v.0[..used], second, of_v);
-        ratios(&m.0[..used], second, &mut self.ratios.block(block)[..used], of_m);
+        narrow(&v.0[..used], second, v_draws);
+        ratios(&m.0[..used], second, &mut self.ratios.block(block)[..used], m_draws);
     }
 }
 

@@ -1,4 +1,4 @@
-//! Auxiliary views: training views that are rendered for a policy's event, with statistics per Gaussian.
+//! Auxiliary views: training views that are rendered for a policy's edit, with statistics per Gaussian.
 //!
 //! Blending is replayed front to back with the arithmetic of the forward pass. Each row's sums over the pixels that
 //! it is blended into, and its largest weight, go to one record per (row, tile); the records of a row are added in
@@ -15,7 +15,7 @@ use super::loss::ErrorRequests;
 use super::passes::{Frame, for_each_pixel, scalars};
 use super::project::Splat;
 use super::rasterize::{
-    ALPHA_MAX, Blending, DARK, DepthPlane, PATCHES, Plane, TRANSMITTANCE, TilePlace,
+    ALPHA_MAX, Blending, DepthPlane, PATCHES, Plane, TRANSMITTANCE, TilePlace, ZERO_PLANE,
 };
 use super::rasterize_bwd::gather_all;
 use super::records::{Sums, TileRecords, parts};
@@ -65,7 +65,7 @@ impl CpuBackend {
                 self.write_map(&frame.grid, target, background, request.map);
                 let columns = self.columns(&frame, &request.columns);
                 for gradient in &mut self.gradient {
-                    gradient.planes[MAP] = DARK;
+                    gradient.planes[MAP] = ZERO_PLANE;
                 }
                 columns
             };
@@ -103,7 +103,7 @@ impl CpuBackend {
         }
         let values = pixel_map(&rgb, target, background, map);
         for (tile, gradient) in self.gradient[..grid.tiles()].iter_mut().enumerate() {
-            gradient.planes[MAP] = DARK;
+            gradient.planes[MAP] = ZERO_PLANE;
             for_each_pixel(grid, tile, |patch, lane, at| {
                 gradient.planes[MAP][patch][lane] = values[at];
             });
@@ -176,7 +176,7 @@ fn radius(splat: &Splat) -> f32 {
 /// Replays the blending of one tile.
 struct Replay<'a> {
     splats: &'a [Splat],
-    /// Sorted.
+    /// The tile's entries, sorted front to back.
     list: &'a [AtomicU64],
     place: TilePlace,
     /// The settings of the forward pass.
@@ -195,16 +195,16 @@ impl WithSimd for Replay<'_> {
     fn with_simd<S: Simd>(self, s: S) {
         let Self { splats, list, place, blending, map, records, batch } = self;
         let c = |x: f32| V::splat(s, x);
-        let least_light = c(blending.transmittance_min);
+        let min_transmittance = c(blending.transmittance_min);
         let zero = V::zero(s);
         // Transmittance of unfinished pixels; 0 for finished ones and outside the image.
-        let (mut light, mut alive) = place.inside();
+        let (mut transmittance, mut unfinished) = place.inside();
         for (n, chunk) in list.chunks(BATCH).enumerate() {
             batch.set(s, splats, chunk, &place);
             for (i, entry) in chunk.iter().enumerate() {
                 let splat = &batch.splats[i];
                 let (mx, my) = (splat.mean[0] - place.x, splat.mean[1] - place.y);
-                let mut todo = batch.patches_of[i] & alive;
+                let mut todo = batch.patches_of[i] & unfinished;
                 let mut sums = [zero; STRIDE];
                 while todo != 0 {
                     let p = todo.trailing_zeros() as usize % PATCHES;
@@ -214,9 +214,9 @@ impl WithSimd for Replay<'_> {
                         let e = u.neg_mul_add(u, z.neg_mul_add(z, c(splat.log2_opacity)));
                         let seen = c(-blending.log2_reach).le(e);
                         let alpha = e.exp2().min(c(ALPHA_MAX));
-                        let t = V::load(s, &light[p][at..]);
+                        let t = V::load(s, &transmittance[p][at..]);
                         let next = alpha.neg_mul_add(t, t);
-                        let blends = least_light.lt(next).and(seen);
+                        let blends = min_transmittance.lt(next).and(seen);
                         let dx = V::load(s, &LANE_X[at..]) + (CORNER_X[p] - mx);
                         let dy = V::load(s, &LANE_Y[at..]) + (CORNER_Y[p] - my);
                         let distance = (dx * dx + dy * dy).sqrt();
@@ -226,14 +226,14 @@ impl WithSimd for Replay<'_> {
                         sums[2] = sums[2] + weight;
                         sums[3] = sums[3] + blends.keep(distance);
                         sums[MAXIMUM] = sums[MAXIMUM].max(weight);
-                        let stopped = next.le(least_light).and(seen);
-                        let left = stopped.select(zero, blends.select(next, t));
-                        left.store(&mut light[p][at..]);
+                        let stopped = next.le(min_transmittance).and(seen);
+                        let remaining = stopped.select(zero, blends.select(next, t));
+                        remaining.store(&mut transmittance[p][at..]);
                     }
                     #[expect(clippy::float_cmp, reason = "finished pixels have exactly 0")]
-                    let all_stopped = light[p] == [0.0; WIDTH];
+                    let all_stopped = transmittance[p] == [0.0; WIDTH];
                     if all_stopped {
-                        alive &= !(1 << p);
+                        unfinished &= !(1 << p);
                     }
                 }
                 let record = records.record(Entry::load(entry), n * BATCH + i);

@@ -155,10 +155,10 @@ impl WithSimd for Optimise<'_> {
             }
             if is_narrow && (due.main || due.rest) {
                 let first_row = self.first_row + b * WIDTH;
-                let [mut of_params, mut of_m, mut of_v] =
+                let [mut param_draws, mut m_draws, mut v_draws] =
                     Draws::of_block(self.rounding_rng, first_row);
-                stored.close(b, trained, &scratch, &mut of_params);
-                moments.close(b, trained, &moment_scratch, [&mut of_m, &mut of_v]);
+                stored.close(b, trained, &scratch, &mut param_draws);
+                moments.close(b, trained, &moment_scratch, [&mut m_draws, &mut v_draws]);
             }
         }
     }

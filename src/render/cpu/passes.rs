@@ -15,8 +15,8 @@ use super::loss::{ErrorRequests, LossValue};
 use super::optimise::Optimise;
 use super::project::{Project, ViewParams};
 use super::rasterize::{
-    Blending, CANVAS_PLANES, DARK, DEPTH, DepthPlane, Rasterize, TRANSMITTANCE, TileCanvas,
-    TilePlace, in_plane,
+    Blending, CANVAS_PLANES, DEPTH, DepthPlane, Rasterize, TRANSMITTANCE, TileCanvas, TilePlace,
+    ZERO_PLANE, in_plane,
 };
 use super::rasterize_bwd::{RasterizeBwd, TileGradient, gather};
 use super::records::{Sums, parts as parts_of_records};
@@ -46,7 +46,7 @@ impl CpuBackend {
         // Never shrinks, so that views of alternating sizes do not initialise the additional tiles each time.
         if self.canvas.len() < tiles {
             self.canvas.resize(tiles, TileCanvas::EMPTY);
-            self.gradient.resize(tiles, TileGradient { planes: [DARK; 5] });
+            self.gradient.resize(tiles, TileGradient { planes: [ZERO_PLANE; 5] });
         }
     }
 
@@ -66,8 +66,8 @@ impl CpuBackend {
         value
     }
 
-    /// Stages 1–3; `colours`, if given, replace the rows' own. Afterwards the canvas holds the image and, if there
-    /// is only one band, the lists hold its entries.
+    /// Stages 1–3; `colours`, if given, replace the rows' own colours. Afterwards the canvas holds the image and, if
+    /// there is only one band, the lists hold its entries.
     pub(super) fn forward(
         &mut self,
         camera: &Camera,
@@ -123,8 +123,8 @@ impl CpuBackend {
                     Project { view, log2_reach, params, rows, splats: &mut *splats, seen: lanes };
                 arch.dispatch(kernel);
                 if let Some(colours) = colours {
-                    let own = &colours[task * ROWS_PER_TASK..];
-                    splats.iter_mut().zip(own).for_each(|(splat, &own)| splat.colour = own);
+                    let colours = &colours[task * ROWS_PER_TASK..];
+                    splats.iter_mut().zip(colours).for_each(|(splat, &c)| splat.colour = c);
                 }
                 seen.iter().map(|seen| seen.count_ones() as usize).sum()
             });
@@ -222,9 +222,9 @@ impl CpuBackend {
 
     /// Reallocates the sums if they were lent or are too small for these records.
     pub(super) fn reserve_sums(&mut self, layout: RecordLayout) {
-        let whole = self.visible.len() * WIDTH * layout.stride();
-        if self.sums.len() < whole {
-            self.sums.resize(whole, 0.0);
+        let needed = self.visible.len() * WIDTH * layout.stride();
+        if self.sums.len() < needed {
+            self.sums.resize(needed, 0.0);
         }
     }
 
@@ -275,17 +275,17 @@ impl CpuBackend {
         let visible = Visible { splats: &splats[..self.rows], seen: visible };
         let tile = |x: usize, y: usize| y / TILE * grid.columns + x / TILE;
         let focal = 0.5 * (view.focal[0] + view.focal[1]);
-        let mut found: Vec<Option<Candidate>> = vec![None; pixels.len()];
+        let mut points: Vec<Option<Candidate>> = vec![None; pixels.len()];
         for band in bands {
-            let here = |x: usize, y: usize| band.contains(&tile(x, y));
-            if bands.len() > 1 && pixels.iter().any(|&(x, y, _)| here(x, y)) {
+            let is_in_band = |x: usize, y: usize| band.contains(&tile(x, y));
+            if bands.len() > 1 && pixels.iter().any(|&(x, y, _)| is_in_band(x, y)) {
                 threads.install(|| lists.refill(threads, visible, grid, band));
             }
             let lists = &*lists;
-            let tasks = found.par_iter_mut().zip(pixels);
+            let tasks = points.par_iter_mut().zip(pixels);
             let point_of =
                 |(slot, &(x, y, error)): (&mut Option<Candidate>, &(usize, usize, f32))| {
-                    if !here(x, y) {
+                    if !is_in_band(x, y) {
                         return;
                     }
                     let at = [x as f32 + 0.5, y as f32 + 0.5];
@@ -301,7 +301,7 @@ impl CpuBackend {
                 };
             threads.install(|| threads.each("surface points", tasks, point_of));
         }
-        found.into_iter().flatten().collect()
+        points.into_iter().flatten().collect()
     }
 
     pub(super) fn rendering(&self, frame: &Frame) -> Rendering {
@@ -340,7 +340,7 @@ impl CpuBackend {
         let (planes, layout) = (signals.planes, signals.layout());
         let signal_stride = signals.blocks.stride();
         let rounding_rng = PolicyRng::new(input.seed, input.step);
-        // Tasks of frozen rows only are skipped.
+        // Tasks that have only frozen rows are skipped.
         let first_row = moments.first();
         let blocks = first_row / WIDTH..rows.div_ceil(WIDTH);
         let tasks = blocks.len().div_ceil(BLOCKS_PER_TASK);

@@ -127,7 +127,7 @@ const SPLAT_FIELDS: usize = 16;
 pub(super) struct Geometry<S: Simd> {
     /// exp(log-scale).
     pub(super) scale: [V<S>; 3],
-    /// Normalised quaternion (w, x, y, z) and 1/|q| of the raw one.
+    /// Normalised quaternion (w, x, y, z), and 1/|q| of the raw quaternion.
     pub(super) quat: [V<S>; 4],
     pub(super) quat_inv_norm: V<S>,
     /// Columns of R(q).
@@ -135,7 +135,7 @@ pub(super) struct Geometry<S: Simd> {
     /// Camera-space position.
     pub(super) p: [V<S>; 3],
     pub(super) inv_z: V<S>,
-    /// x/z and y/z, and the same clamped for J.
+    /// x/z and y/z, and both clamped for J.
     pub(super) ratio: [V<S>; 2],
     pub(super) clamped: [V<S>; 2],
     /// n[i][k] = (row i of J·W) · (axis k); V = n · scale.
@@ -247,13 +247,13 @@ pub(super) fn direction<S: Simd>(
 ) -> ([V<S>; 3], V<S>) {
     let v = each!(i in 3 => lanes(s, block, plane::MEAN + i, at) - view.centre[i]);
     let norm2 = dot(v, v);
-    // Below this the square underflows; the direction is then undefined and its gradient 0.
+    // Below this length the square underflows; the direction and its gradient are then 0.
     let far = V::splat(s, 1e-30).lt(norm2);
     let inv = far.keep(V::splat(s, 1.0) / norm2.sqrt());
     (each!(i in 3 => v[i] * inv), inv)
 }
 
-/// Basis functions up to a degree at `d`.
+/// Spherical-harmonic basis functions up to a degree in the direction `d`.
 #[inline(always)]
 pub(super) fn sh_basis<S: Simd>(s: S, degree: u8, d: [V<S>; 3]) -> [V<S>; 16] {
     let mut y = [V::zero(s); 16];
@@ -351,8 +351,8 @@ impl WithSimd for Project<'_> {
                 let reach = log2_opacity + self.log2_reach;
                 let opaque = V::zero(s).lt(reach);
                 // The determinant overflows if a splat is about 4·10⁹ px wide; its conic factors are then invalid.
-                let alive = in_front.and(opaque).and(sound).and(below(g.det, f32::MAX));
-                if !alive.any() {
+                let rendered = in_front.and(opaque).and(sound).and(below(g.det, f32::MAX));
+                if !rendered.any() {
                     continue;
                 }
                 let [l1, shear, l3] = conic(&g);
@@ -363,13 +363,13 @@ impl WithSimd for Project<'_> {
                     g.ratio[0].mul_add(V::splat(s, view.focal[0]), V::splat(s, view.principal[0]));
                 let v =
                     g.ratio[1].mul_add(V::splat(s, view.focal[1]), V::splat(s, view.principal[1]));
-                let alive = alive.and(reaches(s, u, half_width, view.width)).and(reaches(
+                let rendered = rendered.and(reaches(s, u, half_width, view.width)).and(reaches(
                     s,
                     v,
                     half_height,
                     view.height,
                 ));
-                if !alive.any() {
+                if !rendered.any() {
                     continue;
                 }
                 let (dir, _) = direction(s, block, at, view);
@@ -377,7 +377,7 @@ impl WithSimd for Project<'_> {
                 let raw = raw_colour(s, block, at, degree, &y);
                 let colour = each!(i in 3 => raw[i].max(V::zero(s)));
                 let sound = each!(i in 3 => below(raw[i], COLOUR_MAX));
-                let alive = alive.and(sound[0]).and(sound[1]).and(sound[2]);
+                let rendered = rendered.and(sound[0]).and(sound[1]).and(sound[2]);
                 let ellipse = Ellipse {
                     s,
                     mean: [u, v],
@@ -409,7 +409,7 @@ impl WithSimd for Project<'_> {
                 for (line, field) in out.iter_mut().zip(fields) {
                     field.store(&mut line[at..]);
                 }
-                alive.keep(V::splat(s, 1.0)).store(&mut on_screen[at..]);
+                rendered.keep(V::splat(s, 1.0)).store(&mut on_screen[at..]);
             }
             let used_lanes = WIDTH.min(self.rows - b * WIDTH);
             self.seen[b] = 0;

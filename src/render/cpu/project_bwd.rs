@@ -39,7 +39,7 @@ pub(super) struct BlockGradient {
     /// dL/d(projected mean) `[1/px]`, and the sum over pixels of its absolute value.
     pub(super) mean2d: [[f32; WIDTH]; 2],
     pub(super) mean2d_abs: [[f32; WIDTH]; 2],
-    /// 1 / depth in the camera `[1/scene unit]`.
+    /// 1 / camera-space depth `[1/scene unit]`.
     pub(super) inv_z: [f32; WIDTH],
     /// The sum of the records, one line per value; undefined for values that the layout lacks.
     pub(super) sums: [[f32; WIDTH]; RecordLayout::MOST],

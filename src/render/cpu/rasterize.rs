@@ -1,4 +1,4 @@
-//! Stage 3: from tile lists to pixels. Front to back alpha blending (Kerbl et al. 2023, section 3 and
+//! Stage 3: from tile lists to pixels. Front-to-back alpha blending (Kerbl et al. 2023, section 3 and
 //! appendix C): alpha = min(0.99, o·exp(−p)), skipped below 1/255. A pixel is finished before the first
 //! splat that would reduce its transmittance to 1e-4 or below. The thresholds 1/255 and 1e-4 can be set ([`Blending`]).
 //!
@@ -24,9 +24,9 @@ pub(super) const ALPHA_MAX: f32 = 0.99;
 /// The thresholds of blending, which must be the same in the forward and the backward pass.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Blending {
-    /// A splat is blended where its exponent is at least minus this.
+    /// A splat is blended where its exponent is at least minus this value.
     pub(super) log2_reach: f32,
-    /// A pixel is finished before its transmittance falls to this.
+    /// A pixel is finished before the first splat that would reduce its transmittance to this value or below.
     pub(super) transmittance_min: f32,
 }
 
@@ -89,7 +89,7 @@ pub(super) fn set_row_of_plane(plane: &mut Plane, y: usize, row: &[f32; TILE]) {
 }
 
 /// A plane of zeros.
-pub(super) const DARK: Plane = [[0.0; WIDTH]; PATCHES];
+pub(super) const ZERO_PLANE: Plane = [[0.0; WIDTH]; PATCHES];
 
 /// One rendered tile.
 #[derive(Debug, Clone)]
@@ -104,7 +104,7 @@ pub(super) struct TileCanvas {
 
 impl TileCanvas {
     pub(super) const EMPTY: Self =
-        Self { planes: [DARK; CANVAS_PLANES], stop: [[u32::MAX; WIDTH]; PATCHES] };
+        Self { planes: [ZERO_PLANE; CANVAS_PLANES], stop: [[u32::MAX; WIDTH]; PATCHES] };
 }
 
 /// The position of a tile in the image.
@@ -134,7 +134,7 @@ impl TilePlace {
         if self.width == TILE && self.height == TILE {
             return ([[1.0; WIDTH]; PATCHES], (1 << PATCHES) - 1);
         }
-        let (mut plane, mut patches) = (DARK, 0);
+        let (mut plane, mut patches) = (ZERO_PLANE, 0);
         for y in 0..self.height {
             for x in 0..self.width {
                 let (patch, lane) = in_plane(x, y);
@@ -149,13 +149,13 @@ impl TilePlace {
 /// Renders one tile.
 pub(super) struct Rasterize<'a> {
     pub(super) splats: &'a [Splat],
-    /// Sorted.
+    /// The tile's entries, sorted front to back.
     pub(super) list: &'a [AtomicU64],
     pub(super) place: TilePlace,
     pub(super) background: [f32; 3],
     pub(super) depth_plane: DepthPlane,
     /// The number of pixels in which each row has the largest blend weight, to which the tile adds its pixels; empty
-    /// if they are not counted. Integers, so that the order of tiles does not matter.
+    /// if they are not counted. The counts are integers, so that the order of tiles does not matter.
     pub(super) dominant: &'a [AtomicU32],
     pub(super) blending: Blending,
     pub(super) canvas: &'a mut TileCanvas,
@@ -168,10 +168,10 @@ impl WithSimd for Rasterize<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, s: S) {
-        // Halves or quarters of a patch are processed in pairs, so that common values are loaded once. The rarely
-        // used features share one kernel.
-        let with_more = self.depth_plane != DepthPlane::Unused || !self.dominant.is_empty();
-        match (with_more, matches!(S::F32_LANES, 4 | 8)) {
+        // Halves or quarters of a patch are processed in pairs, so that common values are loaded once. Depth and
+        // dominant pixels, which are rarely needed, share one kernel.
+        let with_extras = self.depth_plane != DepthPlane::Unused || !self.dominant.is_empty();
+        match (with_extras, matches!(S::F32_LANES, 4 | 8)) {
             (true, true) => self.blend::<S, true, 2>(s),
             (true, false) => self.blend::<S, true, 1>(s),
             (false, true) => self.blend::<S, false, 2>(s),
@@ -184,45 +184,45 @@ impl Rasterize<'_> {
     /// Blends the list into the tile, `N` vectors of a patch at a time.
     #[inline(always)]
     #[expect(clippy::too_many_lines, reason = "a numeric kernel")]
-    fn blend<S: Simd, const WITH_MORE: bool, const N: usize>(self, s: S) {
+    fn blend<S: Simd, const WITH_EXTRAS: bool, const N: usize>(self, s: S) {
         let counts = self.depth_plane == DepthPlane::BlendedCount;
         let Self { splats, list, place, background, dominant, canvas, blending, batch, .. } = self;
         let c = |x: f32| V::splat(s, x);
-        let (faintest, least_light) = (c(-blending.log2_reach), c(blending.transmittance_min));
+        let (faintest, t_min) = (c(-blending.log2_reach), c(blending.transmittance_min));
         let (zero, never) = (V::zero(s), c(-1.0));
         let TileCanvas { planes, stop } = canvas;
         let [red, green, blue, finished, depth] = planes;
         for plane in [&mut *red, &mut *green, &mut *blue, &mut *finished, &mut *depth] {
-            *plane = DARK;
+            *plane = ZERO_PLANE;
         }
         // Transmittance of unfinished pixels; 0 for finished ones, whose last value is in `finished`, and outside
         // the image.
-        let (inside, mut alive) = place.inside();
-        let mut light = Aligned(inside);
-        let light = &mut light.0;
-        for (stop, light) in stop.as_flattened_mut().iter_mut().zip(light.as_flattened()) {
-            *stop = if *light > 0.0 { u32::MAX } else { 0 };
+        let (inside, mut unfinished) = place.inside();
+        let mut transmittance = Aligned(inside);
+        let transmittance = &mut transmittance.0;
+        for (stop, t) in stop.as_flattened_mut().iter_mut().zip(transmittance.as_flattened()) {
+            *stop = if *t > 0.0 { u32::MAX } else { 0 };
         }
         // The largest weight of each pixel, and the index of its splat in the list.
-        let mut largest = Aligned(DARK);
+        let mut largest = Aligned(ZERO_PLANE);
         let mut largest_at = [[0_u32; WIDTH]; PATCHES];
         for (first, chunk) in (0..).step_by(BATCH).zip(list.chunks(BATCH)) {
-            if alive == 0 {
+            if unfinished == 0 {
                 break;
             }
             batch.set(s, splats, chunk, &place);
             for p in 0..PATCHES {
                 let reached = batch.splats_of[p];
-                if alive >> p & 1 == 0 || reached == 0 {
+                if unfinished >> p & 1 == 0 || reached == 0 {
                     continue;
                 }
-                let mut takes_light = false;
+                let mut is_unfinished = false;
                 for at in (0..WIDTH).step_by(N * S::F32_LANES) {
-                    let mut t = load_of::<S, N>(s, &light[p][at..]);
+                    let mut t = load_of::<S, N>(s, &transmittance[p][at..]);
                     // Finished pixels must not be finished again.
                     let mut least = t;
                     for n in 0..N {
-                        least[n] = zero.lt(t[n]).select(least_light, never);
+                        least[n] = zero.lt(t[n]).select(t_min, never);
                     }
                     let mut r = load_of::<S, N>(s, &red[p][at..]);
                     let mut g = load_of::<S, N>(s, &green[p][at..]);
@@ -274,7 +274,7 @@ impl Rasterize<'_> {
                             r[n] = w.mul_add(c(splat.colour[0]), r[n]);
                             g[n] = w.mul_add(c(splat.colour[1]), g[n]);
                             b[n] = w.mul_add(c(splat.colour[2]), b[n]);
-                            if WITH_MORE {
+                            if WITH_EXTRAS {
                                 at_depth[n] = if counts {
                                     at_depth[n] + zero.lt(w).keep(c(1.0))
                                 } else {
@@ -289,33 +289,33 @@ impl Rasterize<'_> {
                         }
                         t = next;
                     }
-                    store_of(t, &mut light[p][at..]);
+                    store_of(t, &mut transmittance[p][at..]);
                     store_of(r, &mut red[p][at..]);
                     store_of(g, &mut green[p][at..]);
                     store_of(b, &mut blue[p][at..]);
-                    if WITH_MORE {
+                    if WITH_EXTRAS {
                         store_of(at_depth, &mut depth[p][at..]);
                         store_of(most, &mut largest.0[p][at..]);
                     }
                     for t in t {
-                        takes_light |= zero.lt(t).any();
+                        is_unfinished |= zero.lt(t).any();
                     }
                 }
-                if !takes_light {
-                    alive &= !(1 << p);
+                if !is_unfinished {
+                    unfinished &= !(1 << p);
                 }
             }
         }
         for p in 0..PATCHES {
             for at in (0..WIDTH).step_by(S::F32_LANES) {
-                let t = V::load(s, &light[p][at..]).max(V::load(s, &finished[p][at..]));
+                let t = V::load(s, &transmittance[p][at..]).max(V::load(s, &finished[p][at..]));
                 t.store(&mut finished[p][at..]);
                 add_product(s, t, c(background[0]), &mut red[p][at..]);
                 add_product(s, t, c(background[1]), &mut green[p][at..]);
                 add_product(s, t, c(background[2]), &mut blue[p][at..]);
             }
         }
-        if WITH_MORE && !dominant.is_empty() {
+        if WITH_EXTRAS && !dominant.is_empty() {
             let pixels = largest.0.as_flattened().iter().zip(largest_at.as_flattened());
             for (_, &at) in pixels.filter(|(weight, _)| **weight > 0.0) {
                 let row = Entry::load(&list[at as usize]).row;

@@ -4,7 +4,7 @@
 //! the derivative of Σ g·C is dL/dα = T·(c·g − b), where b is the gradient-weighted colour of
 //! everything behind the splat, background included, normalised by the transmittance there. b is
 //! a running convex combination, b ← b + α(c·g − b): nothing is subtracted from a total, so that
-//! nothing cancels however little light is left.
+//! nothing cancels however little transmittance is left.
 //!
 //! A batch of splats is walked twice. The first walk goes front to back, one patch at a time as in the forward
 //! pass. It computes each alpha, its weight as if nothing were in front of the batch, and the product of all 1 − α;
@@ -25,7 +25,7 @@ use pulp::{Simd, WithSimd};
 use super::batch::{BATCH, Batch};
 use super::project::Splat;
 use super::rasterize::{
-    ALPHA_MAX, Aligned, Blending, DARK, PATCHES, Plane, TRANSMITTANCE, TileCanvas, TilePlace,
+    ALPHA_MAX, Aligned, Blending, PATCHES, Plane, TRANSMITTANCE, TileCanvas, TilePlace, ZERO_PLANE,
 };
 use super::records::TileRecords;
 use super::simd::{V, WIDTH, each, sums_of_four};
@@ -69,7 +69,7 @@ pub(super) struct TileGradient {
 /// Differentiates one tile.
 pub(super) struct RasterizeBwd<'a> {
     pub(super) splats: &'a [Splat],
-    /// Sorted.
+    /// The tile's entries, sorted front to back.
     pub(super) list: &'a [AtomicU64],
     pub(super) place: TilePlace,
     pub(super) background: [f32; 3],
@@ -157,7 +157,7 @@ struct Sums<S: Simd> {
 }
 
 impl BlendedBatch {
-    /// The first walk over a batch, whose first splat is entry `first` of the list. Changes `light` from the
+    /// The first walk over a batch, whose first splat is entry `first` of the list. Changes `transmittance` from the
     /// transmittance behind the batch to the one in front. Returns the end of each patch's pairs.
     #[inline(always)]
     fn fill<S: Simd>(
@@ -167,7 +167,7 @@ impl BlendedBatch {
         first: usize,
         blending: Blending,
         canvas: &TileCanvas,
-        light: &mut Plane,
+        transmittance: &mut Plane,
     ) -> [usize; PATCHES] {
         let c = |x: f32| V::splat(s, x);
         let faintest = c(-blending.log2_reach);
@@ -199,8 +199,8 @@ impl BlendedBatch {
                     pair += 1;
                 }
                 // Where the product underflows, the transmittance behind has underflowed too.
-                let light = &mut light[p][at..];
-                (V::load(s, light) / product.max(c(f32::MIN_POSITIVE))).store(light);
+                let t = V::load(s, &transmittance[p][at..]) / product.max(c(f32::MIN_POSITIVE));
+                t.store(&mut transmittance[p][at..]);
             }
             start += reached.count_ones() as usize;
             ends[p] = start;
@@ -219,9 +219,9 @@ impl RasterizeBwd<'_> {
         let [gr, gg, gb, ga, map] = &upstream.planes;
 
         // State per pixel behind the current splat.
-        let mut light = Aligned(canvas.planes[TRANSMITTANCE]);
-        let mut behind = Aligned(DARK);
-        let (light, behind) = (&mut light.0, &mut behind.0);
+        let mut transmittance = Aligned(canvas.planes[TRANSMITTANCE]);
+        let mut behind = Aligned(ZERO_PLANE);
+        let (transmittance, behind) = (&mut transmittance.0, &mut behind.0);
         // One past the last list entry that is blended into any pixel of the patch.
         let mut patch_end = [0_u32; WIDTH];
         for (p, end) in patch_end.iter_mut().enumerate() {
@@ -247,7 +247,7 @@ impl RasterizeBwd<'_> {
             for (p, &end) in patch_end.iter().enumerate() {
                 batch.cut(p, (end as usize).saturating_sub(first));
             }
-            let mut ends = blended.fill(s, batch, first, blending, canvas, light);
+            let mut ends = blended.fill(s, batch, first, blending, canvas, transmittance);
             for (i, splat) in batch.splats[..chunk.len()].iter().enumerate().rev() {
                 let mut todo = batch.patches_of[i];
                 let colour = each!(i in 3 => c(splat.colour[i]));
@@ -272,25 +272,25 @@ impl RasterizeBwd<'_> {
                         let [u, z] = batch.u_and_z(s, i, p, at);
                         let alpha = V::load(s, &blended.alpha[pair][at..]);
                         let part = V::load(s, &blended.weight[pair][at..]);
-                        let w = part * V::load(s, &light[p][at..]);
+                        let w = part * V::load(s, &transmittance[p][at..]);
                         let (r, g, b) = (
                             V::load(s, &gr[p][at..]),
                             V::load(s, &gg[p][at..]),
                             V::load(s, &gb[p][at..]),
                         );
-                        let mut own = colour[0].mul_add(r, colour[1].mul_add(g, colour[2] * b));
+                        let mut cg = colour[0].mul_add(r, colour[1].mul_add(g, colour[2] * b));
                         if EXTRAS >= extra::ERROR {
                             let m = V::load(s, &map[p][at..]);
                             sums.map = w.mul_add(m, sums.map);
                             if EXTRAS == extra::ALL {
-                                own = at_depth.mul_add(m, own + V::load(s, &ga[p][at..]));
+                                cg = at_depth.mul_add(m, cg + V::load(s, &ga[p][at..]));
                             }
                         }
-                        let was = V::load(s, &behind[p][at..]);
-                        let ahead = own - was;
-                        alpha.mul_add(ahead, was).store(&mut behind[p][at..]);
+                        let old_b = V::load(s, &behind[p][at..]);
+                        let cg_minus_b = cg - old_b;
+                        alpha.mul_add(cg_minus_b, old_b).store(&mut behind[p][at..]);
                         // Alpha has no gradient at its clamp.
-                        let q = alpha.lt(c(ALPHA_MAX)).keep(w * ahead);
+                        let q = alpha.lt(c(ALPHA_MAX)).keep(w * cg_minus_b);
                         let qu = q * u;
                         let qz = q * z;
                         let base = &mut sums.base;

@@ -50,7 +50,7 @@ impl<'a> TileRecords<'a> {
     }
 }
 
-/// The sums of the records.
+/// The sums of the rows' records.
 pub(super) struct Sums<'a> {
     /// Shape: `[rows, stride]`, or more rows.
     pub(super) sums: &'a mut [f32],
@@ -86,9 +86,9 @@ fn divide(firsts: &[u32], cap: usize) -> Vec<Part> {
         let mut entries = from..firsts[end] as usize;
         // These entries become several parts only if they belong to a single tile and exceed `cap`.
         while !entries.is_empty() {
-            let some = entries.start..entries.end.min(entries.start + cap);
-            entries.start = some.end;
-            parts.push(Part { tiles: start..end, entries: Some(some) });
+            let piece = entries.start..entries.end.min(entries.start + cap);
+            entries.start = piece.end;
+            parts.push(Part { tiles: start..end, entries: Some(piece) });
         }
         start = end;
     }

@@ -37,7 +37,7 @@ impl Terms {
                 let to = &mut gradient[p * WIDTH + at..(p + 1) * WIDTH];
                 (V::load(s, to) + x).store(to);
             };
-            // The sigmoid's derivative e^x / (1 + e^x)² is even; evaluated for x <= 0, nothing cancels.
+            // The sigmoid's derivative e^x / (1 + e^x)² is even; it is evaluated for x <= 0, where nothing cancels.
             let e = (V::zero(s) - lanes(s, params, plane::OPACITY, at).abs()).exp();
             let sum = one + e;
             put(plane::OPACITY, e / (sum * sum) * self.opacity);
@@ -49,7 +49,7 @@ impl Terms {
 }
 
 /// Noise is skipped for rows whose share of it is less than this, 2⁻²⁴. At the published strength (5e5 times a step
-/// size of 1.6e-4) that is 5e-6 σ² per step, and 1e-3 σ² after 30,000 steps.
+/// size of 1.6e-4) this share moves a mean by 5e-6 σ² per step, and by 1e-3 σ² in 30,000 steps.
 const LEAST_SHARE: f32 = 5.960_464_5e-8;
 
 /// The noise of one step.

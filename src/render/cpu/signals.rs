@@ -107,9 +107,9 @@ impl SignalPlanes {
                     | Signal::Colour => continue,
                 };
                 let to = &mut block[plane * WIDTH + at..(plane + 1) * WIDTH];
-                let was = V::load(s, to);
+                let old = V::load(s, to);
                 let is_sum = matches!(signal.kind(), SignalKind::Sum | SignalKind::Count);
-                (if is_sum { was + x } else { was.max(x) }).store(to);
+                (if is_sum { old + x } else { old.max(x) }).store(to);
             }
         }
     }

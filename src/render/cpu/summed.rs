@@ -207,12 +207,12 @@ impl TaskSums<'_> {
         due: Stepping,
     ) -> bool {
         let sums = self.sums.block(block);
-        let classes = [
+        let groups = [
             (0..trained.min(plane::SH_REST), due.main, due.had_sums.main),
             (plane::SH_REST..trained, due.rest, due.had_sums.rest),
         ];
         let mut changed = false;
-        for (planes, steps, had_sums) in classes {
+        for (planes, steps, had_sums) in groups {
             if planes.start < self.first || planes.is_empty() || (steps && !had_sums) {
                 continue;
             }

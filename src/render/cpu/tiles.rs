@@ -40,7 +40,7 @@ const MAX_CHUNKS: usize = 256;
 const MIN_ROWS_PER_CHUNK: usize = 128;
 /// Maximum number of tasks that add up counters.
 const MAX_RUNS: usize = 64;
-/// Minimum number of tiles of such a task.
+/// Minimum number of tiles per task that adds up counters.
 const MIN_TILES_PER_RUN: usize = 64;
 
 /// An image as a grid of tiles.
@@ -341,7 +341,7 @@ impl TileLists {
         self.row_of_slot[slot].load(Relaxed) as usize
     }
 
-    /// The slots of `row` in the band, in order of tile number. Only for visible rows.
+    /// The slots of a visible row in the band, in order of tile number.
     pub(super) fn slots_of_row(&self, row: usize) -> Range<usize> {
         let [first, count] = self.slots[row];
         first as usize..(first + count) as usize
@@ -352,14 +352,14 @@ impl TileLists {
 /// exceeds. Also returns the number of all entries.
 fn divide(entries: impl Iterator<Item = u64>, cap: u64) -> (Vec<Range<usize>>, u64) {
     let mut bands = Vec::with_capacity(1);
-    let (mut start, mut end, mut held, mut total) = (0, 0, 0, 0);
-    for here in entries {
-        if held + here > cap {
+    let (mut start, mut end, mut in_band, mut total) = (0, 0, 0, 0);
+    for in_tile in entries {
+        if in_band + in_tile > cap {
             bands.push(start..end);
-            (start, held) = (end, 0);
+            (start, in_band) = (end, 0);
         }
-        held += here;
-        total += here;
+        in_band += in_tile;
+        total += in_tile;
         end += 1;
     }
     bands.push(start..end);
@@ -393,15 +393,15 @@ mod tests {
                 let most = bands.iter().map(|band| band.len() as u64 * rows).max();
                 assert!(most.is_some_and(|most| most <= cap), "{rows} rows, cap {cap}");
                 let tiles: usize = bands.iter().map(Range::len).sum();
-                let whole = bands.windows(2).all(|pair| pair[0].end == pair[1].start);
-                assert!(whole && bands[0].start == 0 && tiles as u64 == TILES);
+                let adjacent = bands.windows(2).all(|pair| pair[0].end == pair[1].start);
+                assert!(adjacent && bands[0].start == 0 && tiles as u64 == TILES);
                 // No more bands than are needed.
                 let per_band = cap / rows;
                 assert_eq!(bands.len() as u64, TILES.div_ceil(per_band));
             }
         }
-        let (none, total) = divide(std::iter::empty(), 5);
-        assert!(none.len() == 1 && none[0].is_empty() && total == 0);
+        let (bands, total) = divide(std::iter::empty(), 5);
+        assert!(bands.len() == 1 && bands[0].is_empty() && total == 0);
     }
 
     #[test]

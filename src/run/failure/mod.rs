@@ -32,10 +32,10 @@ pub const OTHER: u8 = 1;
 pub const INPUT: u8 = 2;
 /// Exit code if a measured value is beyond the limit that was given for it.
 pub const LIMIT: u8 = 4;
-/// Exit code if the device or the memory does not suffice.
+/// Exit code if the device is unsuitable or lost, or there is too little memory.
 pub const DEVICE: u8 = 3;
 
-/// The failure of a run or a command. Displayed with options spelled as on a terminal.
+/// The failure of a run or a command. It is displayed with options spelled as on a terminal.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[error("{}", self.words(Spelling::Terminal))]
 pub struct Failure {
@@ -55,13 +55,13 @@ enum Part {
 }
 
 impl Failure {
-    /// A failure whose message names no option, or comes from a command.
+    /// A failure with a complete message: one that names no option, or that comes from a command.
     #[expect(clippy::needless_pass_by_value, reason = "errors are passed as they come")]
     pub fn new(code: u8, message: impl ToString) -> Self {
         Self { code, parts: vec![Part::Text(message.to_string())] }
     }
 
-    /// Bad input: a file, an option, a field.
+    /// A failure because of bad input: a file, an option or a field.
     pub fn input(message: impl ToString) -> Self {
         Self::new(INPUT, message)
     }
@@ -71,13 +71,13 @@ impl Failure {
         Self { code, parts: vec![Part::Problem(Box::new(problem.into()))] }
     }
 
-    /// The same failure, prefixed with its origin.
+    /// The same failure, with its origin before the message.
     #[must_use]
     pub fn within(self, origin: &str) -> Self {
         self.with_prefix([Part::Text(format!("{origin}: "))])
     }
 
-    /// The same failure, prefixed with an option, and with its value if there is one.
+    /// The same failure, with an option, and its value if there is one, before the message.
     #[must_use]
     pub fn within_option(self, option: &'static str, value: Option<String>) -> Self {
         self.with_prefix([Part::Option(option, value), Part::Text(": ".to_owned())])
@@ -147,11 +147,11 @@ impl OptionProblem {
     }
 }
 
-/// Errors that are always caused by bad input.
+/// Errors that are always due to bad input.
 pub trait BadInput: Display {}
 
 impl BadInput for FormatError {}
-/// Before training: the policy's name or parameters are wrong.
+/// Before training, such an error means that the policy's name or parameters are wrong.
 impl BadInput for PolicyError {}
 
 impl<E: BadInput> From<E> for Failure {
@@ -182,7 +182,7 @@ impl Failure {
 }
 
 impl BackendRemedy {
-    /// The remedy for an error, and the exit code: that of bad input if other arguments would avoid the error.
+    /// The exit code and the remedy for an error; the code is that of bad input if other options would avoid the error.
     fn for_error(error: &BackendError) -> (u8, Self) {
         match error {
             BackendError::OutOfMemory { .. } => (DEVICE, Self::LessMemory),

@@ -1,4 +1,4 @@
-//! Notes to the user that name options, for runs without errors.
+//! Messages to the user that name options, other than errors.
 
 use std::path::Path;
 
@@ -19,7 +19,7 @@ pub(crate) fn antialias_option(spelling: Spelling, kernel: Antialiasing) -> Stri
     }
 }
 
-/// The device, with a hint where another choice may be better.
+/// The line that names the device, with a hint where another choice may be better.
 pub(crate) fn device(s: Spelling, device: &Device) -> String {
     let device = match device {
         Device::Processor if BackendKind::Gpu.is_built() => {
@@ -40,7 +40,7 @@ pub(crate) fn device(s: Spelling, device: &Device) -> String {
     format!("device   {device}")
 }
 
-/// A note of a dataset.
+/// A note about a dataset.
 pub(crate) fn dataset(s: Spelling, note: &Note) -> String {
     match note {
         Note::Text(text) => format!("note: {text}"),
@@ -66,7 +66,7 @@ pub(crate) fn dataset(s: Spelling, note: &Note) -> String {
     }
 }
 
-/// The order in which gradients are added up.
+/// The line that names the order in which gradients are added up.
 pub(crate) fn accumulation(s: Spelling, taken: Accumulation) -> String {
     let note = if taken.is_deterministic() {
         "runs are reproducible byte for byte".to_owned()
@@ -86,10 +86,10 @@ pub(crate) fn hidden_points(s: Spelling, near: f64, hidden: &str, is_given: bool
     format!("note: {hidden} of what the views show lies nearer than {near}, and is hidden{remedy}")
 }
 
-/// The part of the promised memory that is only for speed.
+/// The line that names the part of the promised memory that only makes the run faster.
 pub(crate) fn for_speed(s: Spelling, needed: u64, speed: u64) -> String {
     format!(
-        "needed   {}; the other {} are for speed (longer tile lists, decoded images): with {} they are the first to go",
+        "needed   {}; the other {} are for speed (longer tile lists, decoded images): with {} they are given up first",
         Bytes(needed),
         Bytes(speed),
         s.option("memory")
@@ -118,7 +118,7 @@ pub(crate) fn other_coordinates(
     )
 }
 
-/// World coordinates are too coarse in f32.
+/// The problem that world coordinates are too coarse in f32, with the remedy.
 pub(crate) fn coarse(s: Spelling, coarseness: &Coarseness, may_be_double: bool) -> String {
     let local = s.text("coordinates", "local");
     if may_be_double {
@@ -128,7 +128,7 @@ pub(crate) fn coarse(s: Spelling, coarseness: &Coarseness, may_be_double: bool) 
     format!("{coarseness}; {local} keeps positions exact")
 }
 
-/// A file is in local coordinates because those of the world are too coarse.
+/// The note that a file is in local coordinates because world coordinates are too coarse.
 pub(crate) fn saved_in_local(s: Spelling, coarseness: &Coarseness, offset: [f64; 3]) -> String {
     format!(
         "note: saved in local coordinates, relative to the offset {}: {coarseness} (choose others with {} or {})",
@@ -138,7 +138,7 @@ pub(crate) fn saved_in_local(s: Spelling, coarseness: &Coarseness, offset: [f64;
     )
 }
 
-/// World coordinates will be too coarse for the Gaussians that training is expected to make.
+/// The line before training that world coordinates in f32 will be too coarse for the Gaussians that training may make.
 pub(crate) fn expected_coarse(
     s: Spelling,
     coarseness: &Coarseness,
@@ -159,13 +159,13 @@ pub(crate) fn expected_coarse(
     )
 }
 
-/// The hint on how to learn exposures if the tracks do not show whether they differ.
+/// The hint on how to learn exposures if the tracks do not show whether exposures differ.
 pub(crate) fn learn_exposures(s: Spelling) -> String {
     format!("{} learns exposures anyway", s.text("exposure", "on"))
 }
 
-/// The budget and the reason for it. `most`: the maximum number of rows that the user gave, if any; `solved`: the
-/// memory limit, and true if it determines the number of rows.
+/// The line that names the budget and the reason for it. `most`: the maximum number of rows that the user gave, if any;
+/// `solved`: the memory limit if there is one, and true if it determines the number of rows.
 pub(crate) fn budget(
     s: Spelling,
     rows: usize,
@@ -207,7 +207,7 @@ pub(crate) fn degree_lowered(
     )
 }
 
-/// The part of the memory limit that is left.
+/// The line that names the unused part of the memory limit.
 pub(crate) fn memory_left(s: Spelling, bytes: u64) -> String {
     format!("\n  {:<11} {} of {}", "left", Bytes(bytes), s.option("memory"))
 }

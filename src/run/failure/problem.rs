@@ -1,4 +1,4 @@
-//! Everything that can be wrong with a run, as data: the option or file, its content, and a valid alternative. Options
+//! Everything that can be wrong with a run, as data: the option or file, its value, and a valid alternative. Options
 //! are named as [`OPTIONS`](crate::OPTIONS) names them.
 
 use std::path::PathBuf;
@@ -25,7 +25,7 @@ pub enum OptionProblem {
     NoScene,
     /// The model is to be saved or tested after an iteration that the run does not have.
     IterationOutOfRange { option: &'static str, step: u32, last: u32 },
-    /// A value cannot be parsed; `origin` is its source.
+    /// A value cannot be parsed; `origin` names its source.
     Malformed { origin: String, problem: String },
     /// `deterministic` contradicts the knob `accumulation`.
     AccumulationConflict { given: Accumulation },
@@ -51,7 +51,7 @@ pub enum OptionProblem {
 #[derive(Debug, Clone, PartialEq)]
 #[expect(missing_docs, reason = "the fields are the data of the message of each variant")]
 pub enum SizeProblem {
-    /// More views than can be counted.
+    /// The scene has more views than can be counted.
     TooManyViews,
     /// Frozen Gaussians leave no room in the budget.
     FreezeFillsBudget { frozen: usize, budget: usize },
@@ -87,9 +87,9 @@ pub enum ModelProblem {
     AntialiasingDiffers { init: Antialiasing, frozen: Antialiasing },
     /// The model of `freeze` has changed.
     FreezeChanged { file: PathBuf, rows: usize, expected: usize },
-    /// A model is in other coordinates than the photographs.
+    /// A model is in other coordinates than the dataset.
     OtherCoordinates { option: Option<&'static str>, file: PathBuf, correlation: f64 },
-    /// A split has no views.
+    /// The test split has no views.
     NoTestViews,
     /// The dataset of a run is no longer where it was.
     DatasetMoved,
@@ -141,18 +141,18 @@ pub enum TrainingProblem {
     LeftBehind { run: PathBuf, checkpoint: Option<PathBuf>, scene: PathBuf },
 }
 
-/// Any problem with a run.
+/// Any problem with a run, or its remedy.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Problem {
-    /// With its options.
+    /// A problem with the options.
     Options(OptionProblem),
-    /// With its size.
+    /// A problem with the size of the run.
     Size(SizeProblem),
-    /// With a model.
+    /// A problem with a model.
     Model(ModelProblem),
-    /// With resuming it.
+    /// A problem with resuming the run.
     Resume(ResumeProblem),
-    /// During training.
+    /// A problem during training.
     Training(TrainingProblem),
     /// The remedy for an error of a backend, whose message precedes it.
     Backend(BackendRemedy),
@@ -167,13 +167,13 @@ pub enum Problem {
 pub enum TrainRemedy {
     /// Another folder, or replacing the run in this one.
     OtherFolderOrOverwrite,
-    /// Waiting for or stopping the process that trains in the folder, or another folder.
+    /// Waiting for the process that trains in the folder, stopping it, or another folder.
     WaitOrOtherFolder,
     /// Another folder.
     OtherFolder,
-    /// A budget.
+    /// A budget of at least 1.
     Budget,
-    /// A degree.
+    /// A suitable degree.
     Degree,
     /// A start from random points.
     RandomStart,
@@ -194,7 +194,7 @@ pub enum BackendRemedy {
     ListAdapters,
     /// Naming no adapter, or not choosing the native backend.
     NoAdapterOrGpu,
-    /// A program with the GPU backend.
+    /// A program built with the GPU backend.
     BuildWithGpu,
     /// A budget of this many Gaussians.
     Budget(u64),
@@ -225,7 +225,7 @@ pub enum Remedy {
     LeastDegree,
     /// Photographs smaller by this factor.
     Shrink(u32),
-    /// This much memory `[MiB]`.
+    /// A memory limit `[MiB]`.
     Memory(u64),
     /// At most this many rows.
     Budget(usize),
@@ -238,8 +238,8 @@ pub struct Difference {
     pub option: String,
     /// The part of the option, such as a knob; empty for options without parts.
     pub member: String,
-    /// The value now, as text; `None`: not set.
+    /// The value given now, as text; `None`: not set.
     pub now: Option<String>,
-    /// The value in the run being resumed.
+    /// The value in the run being resumed, as text; `None`: not set.
     pub then: Option<String>,
 }

@@ -16,10 +16,10 @@ use super::problem::{
 };
 
 /// The remedy for a model in other coordinates.
-const COORDINATES: &str = "export it untransformed, or transform it back";
+const TRANSFORM_BACK: &str = "export it untransformed, or transform it back";
 
 impl Problem {
-    /// A sentence that names what is wrong, and the remedy.
+    /// The message: what is wrong, and the remedy.
     pub fn words(&self, spelling: Spelling) -> String {
         match self {
             Self::Options(problem) => problem.words(spelling),
@@ -154,9 +154,9 @@ impl OptionProblem {
         let full = s.switch("full");
         match self {
             Self::UnknownOption { name, nearest } => {
-                let like = nearest.as_ref().map(|like| format!(" (did you mean `{like}`?)"));
-                let like = like.unwrap_or_default();
-                format!("no option is called `{name}`{like}; docs/options.md lists them all")
+                let hint = nearest.as_ref().map(|like| format!(" (did you mean `{like}`?)"));
+                let hint = hint.unwrap_or_default();
+                format!("no option is called `{name}`{hint}; docs/options.md lists them all")
             }
             Self::Value { option, problem } => format!("{}: {problem}", s.option(option)),
             Self::Conflict { option, problem } => format!("{} {problem}", s.option(option)),
@@ -278,14 +278,14 @@ impl ModelProblem {
             ),
             Self::InitOutOfView { file: model, seen, rows } => format!(
                 "{}: only {} of its {} Gaussians lie in any training view; it must be in the coordinates of the \
-                 dataset: {COORDINATES}",
+                 dataset: {TRANSFORM_BACK}",
                 file("init", model),
                 grouped(*seen),
                 grouped(*rows)
             ),
             Self::FreezeOutOfView { file: model, rows } => format!(
                 "{}: none of its {} Gaussians lies in any training view; it must be in the coordinates of the dataset: \
-                 {COORDINATES}",
+                 {TRANSFORM_BACK}",
                 file("freeze", model),
                 grouped(*rows)
             ),
@@ -306,7 +306,7 @@ impl ModelProblem {
                 let model = model_name(s, *option, model);
                 format!(
                     "{model}: it shows nothing of the photographs (their correlation is {correlation:.2}); it must be \
-                     in the coordinates of the dataset (axes, scale and origin): {COORDINATES}"
+                     in the coordinates of the dataset (axes, scale and origin): {TRANSFORM_BACK}"
                 )
             }
             Self::NoTestViews => format!(
@@ -468,7 +468,7 @@ impl Remedy {
     }
 }
 
-/// A model, shown with the option that names it if there is one.
+/// A model's file, with the option that names it if there is one.
 pub(super) fn model_name(s: Spelling, option: Option<&str>, file: &Path) -> String {
     let file = file.display();
     option.map_or_else(|| file.to_string(), |option| s.text(option, &file))
@@ -512,8 +512,8 @@ mod tests {
     fn options_are_spelled_as_users_write_them() {
         let remedies = vec![vec![Remedy::NoImages, Remedy::Shrink(4)], vec![Remedy::Memory(96)]];
         let (memory, rows, sh_degree, needed) = (64 << 20, 1_000, 0, 96);
-        let fits = SizeProblem::NoModelFits { memory, rows, sh_degree, needed, remedies };
-        let failure = Failure::from(fits).within_option("config", Some("a.toml".to_owned()));
+        let problem = SizeProblem::NoModelFits { memory, rows, sh_degree, needed, remedies };
+        let failure = Failure::from(problem).within_option("config", Some("a.toml".to_owned()));
         assert_eq!(failure.code, INPUT);
         assert_eq!(
             failure.to_string(),
@@ -525,8 +525,8 @@ mod tests {
             "config=\"a.toml\": memory=\"64.0 MiB\" holds no model of this scene: 1,000 rows at degree 0 take 96 \
              MiB; give image_cache=0 resolution=4, or memory=\"96MiB\""
         );
-        let given = OptionProblem::AutomaticWithFull { option: "sh_degree" };
-        let words = Failure::from(given).words(Spelling::Keyword);
+        let problem = OptionProblem::AutomaticWithFull { option: "sh_degree" };
+        let words = Failure::from(problem).words(Spelling::Keyword);
         assert!(words.ends_with("or full=True with sh_degree=3"), "{words}");
     }
 }

@@ -1,4 +1,4 @@
-//! A run's description, with its inputs and all choices that do not depend on its size.
+//! A run's description, with its inputs and all choices that do not depend on the size of the run.
 
 use std::borrow::Cow;
 
@@ -28,15 +28,15 @@ use densify_train::trainer::{AutoChoices, growth_signals};
 
 /// Maximum number of random initial points without `--init-points` (Kerbl et al. 2023 use 100,000).
 const RANDOM_POINTS: usize = 100_000;
-/// Resident memory by which a process that resumes a run may exceed the one that began it `[bytes]`. The ledger keeps
-/// more room than this for the allocator.
+/// Resident memory by which a process that resumes a run may exceed the process that began it `[bytes]`. The ledger
+/// reserves more than this for the allocator.
 const RESUME_TOLERANCE: u64 = 1 << 20;
-/// Threads that decode training views ahead of the trainer.
+/// Number of threads that decode training views ahead of the trainer.
 pub(crate) const DECODERS: usize = 2;
-/// Threads that decode test views.
+/// Number of threads that decode test views.
 pub(crate) const TEST_DECODERS: usize = 1;
 
-/// A run before its size is known. Trials of other sizes and options share the inputs.
+/// A run before its size is known. Cases with other sizes and options share the inputs.
 pub(crate) struct Case<'a> {
     /// The description, as the user gave it.
     pub(crate) spec: &'a RunSpec,
@@ -48,7 +48,7 @@ pub(crate) struct Case<'a> {
 #[derive(Clone)]
 pub(crate) struct Choices {
     pub(crate) entry: &'static PolicyEntry,
-    /// The policy's parameters as set; the others have the policy's defaults.
+    /// The policy's parameters that are set; the others have the policy's defaults.
     pub(crate) parameters: Table,
     pub(crate) knobs: Knobs,
     pub(crate) degree: Degree,
@@ -58,7 +58,7 @@ pub(crate) struct Choices {
     pub(crate) position_rates: PositionRates,
     /// Choices that the run makes while it trains.
     pub(crate) automatic: AutoChoices,
-    /// Threads that train and measure.
+    /// Number of threads that train and measure.
     pub(crate) threads: usize,
 }
 
@@ -76,8 +76,8 @@ pub(crate) enum Init {
 impl Choices {
     /// Messages about the choices that depend on the scene.
     pub(super) fn lines(&self, spelling: Spelling) -> impl Iterator<Item = String> {
-        let of_depths = self.near.line(spelling).into_iter().chain(self.position_rates.line());
-        of_depths.chain(self.degree.line()).chain(self.exposure.line(spelling))
+        let depths = self.near.line(spelling).into_iter().chain(self.position_rates.line());
+        depths.chain(self.degree.line()).chain(self.exposure.line(spelling))
     }
 }
 
@@ -105,19 +105,19 @@ impl<'a> Case<'a> {
         host: Host<'_>,
     ) -> Result<Self, Failure> {
         let decides_exposures = spec.schedule.exposure != ExposureChoice::Off && !has_checkpoint;
-        let found = &saved.resolved;
+        let findings = &saved.resolved;
         let reading = Reading {
             // A checkpoint contains the rows of both models, so their files may no longer exist.
-            models: Some([found.init_model, found.frozen]),
+            models: Some([findings.init_model, findings.frozen]),
             tracks: decides_exposures,
             colours: true,
             exif: decides_exposures,
             tolerance: RESUME_TOLERANCE,
         };
         Self::open(spec, &reading, host, |evidence| {
-            let degree = Degree::decide(spec, Some(found.sh_degree_from), evidence);
+            let degree = Degree::decide(spec, Some(findings.sh_degree_from), evidence);
             let exposure = if has_checkpoint {
-                Exposure::known(found.has_exposures, found.exposure_from)
+                Exposure::known(findings.has_exposures, findings.exposure_from)
             } else {
                 Exposure::decide(spec, evidence)
             };
@@ -261,7 +261,7 @@ impl<'a> Case<'a> {
         RowBudget { total, frozen: self.frozen_rows() }
     }
 
-    /// The total of a budget in which this many rows can be trained.
+    /// The total budget, frozen rows included, in which this many rows can be trained.
     pub(super) fn rows_for(&self, trainable: usize) -> usize {
         RowBudget::for_trainable(trainable, self.frozen_rows()).total
     }
@@ -316,8 +316,8 @@ fn random_points(trainable: usize) -> usize {
 fn check_automatic(spec: &RunSpec) -> Result<(), Failure> {
     let is_auto_budget = spec.size.budget.is_some_and(Budget::is_auto);
     let is_auto_degree = matches!(spec.size.sh_degree, Some(ShDegree::Auto(_)));
-    for (is_given, option) in [(is_auto_budget, "budget"), (is_auto_degree, "sh_degree")] {
-        if spec.size.full && is_given {
+    for (is_auto, option) in [(is_auto_budget, "budget"), (is_auto_degree, "sh_degree")] {
+        if spec.size.full && is_auto {
             return Err(OptionProblem::AutomaticWithFull { option }.into());
         }
     }
@@ -327,7 +327,7 @@ fn check_automatic(spec: &RunSpec) -> Result<(), Failure> {
     Ok(())
 }
 
-/// The antialiasing of the run: that of the option, or that of the models it starts from.
+/// The antialiasing of the run: that of the option, or else that of the models that the run starts from.
 ///
 /// # Errors
 /// When the models of `--init` and `--freeze` differ and no option decides.

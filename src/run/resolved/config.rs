@@ -35,11 +35,11 @@ pub struct RunConfig {
     pub sh_degree: u8,
 }
 
-/// Facts that were found when a run was prepared.
+/// Facts that preparing a run has found, and the reasons for its choices.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Findings {
-    /// The folder that relative paths start from.
+    /// The folder that a relative path of the dataset starts from.
     pub working_directory: Option<PathBuf>,
     /// The GPU adapter that trained; `None`: the processor.
     pub adapter: Option<String>,
@@ -50,13 +50,13 @@ pub struct Findings {
     pub extended_to: Option<u32>,
     /// The reason for the degree.
     pub sh_degree_from: DegreeSource,
-    /// `--memory` made the degree lower than requested.
+    /// True if `--memory` made the degree lower than requested.
     pub sh_degree_lowered: bool,
     /// The reason for learning exposures or not.
     pub exposure_from: ExposureSource,
-    /// Exposures are learned.
+    /// True if exposures are learned.
     pub has_exposures: bool,
-    /// The model that the run began from.
+    /// The model that the run started from.
     pub init_model: Option<ModelSize>,
     /// The model whose Gaussians never change.
     pub frozen: Option<ModelSize>,
@@ -70,7 +70,7 @@ pub struct ModelSize {
     pub rows: usize,
     /// Spherical-harmonic degree.
     pub sh_degree: u8,
-    /// Antialiasing; not in the file of a model without it.
+    /// Its antialiasing; not written for a model without antialiasing.
     #[serde(default, skip_serializing_if = "is_none")]
     pub antialiasing: Antialiasing,
 }
@@ -116,7 +116,7 @@ impl RunConfig {
         let ResolvedRun { case, size, init, degree_lowered, .. } = run;
         let (inputs, choices, asked) = (&case.inputs, &case.choices, case.spec);
         let mut spec = asked.clone();
-        // The output folder is the one that holds the file.
+        // The output folder is the one that holds `config.toml`.
         spec.output.output = None;
         let budget = asked.size.budget.unwrap_or(Budget::Rows(size.rows));
         spec.size.budget = Some(budget.limited_to(size.rows));
@@ -124,7 +124,7 @@ impl RunConfig {
             Some(ShDegree::Auto(_)) => ShDegree::Auto(Some(size.sh_degree)),
             _ => ShDegree::Fixed(size.sh_degree),
         });
-        // If the knob is set, it determines the length of the tile lists.
+        // If the knob `pairs_per_row` is set, it determines the length of the tile lists.
         spec.size.tile_cap = choices.knobs.pairs_per_row.is_none().then_some(Rows(size.tile_cap));
         spec.size.image_cache = Some(ImageCache::Bytes(size.image_cache));
         spec.device.backend = inputs.device.kind().choice();
@@ -226,8 +226,8 @@ impl RunConfig {
         let text = densify_core::files::read_text(&path, densify_core::files::MAX_OPTIONS_BYTES)
             .map_err(|error| match error.kind() {
                 _ if is_archive(run) => Failure::input(format!(
-                    "{} is a ZIP archive, but no SOG model; unpack it, and name a file of Gaussian splats, or the folder of \
-                     a run, in it",
+                    "{} is a ZIP archive, but not a SOG model; unpack it, and name a file of Gaussian splats, or the \
+                     folder of a run, in it",
                     run.display()
                 )),
                 std::io::ErrorKind::NotFound | std::io::ErrorKind::NotADirectory => {
@@ -247,11 +247,11 @@ impl RunConfig {
         self.resolved.extended_to.unwrap_or(0).max(self.spec.schedule.iterations.0)
     }
 
-    /// The dataset's folder: relative to the folder in which the run was started, if it exists there, or else as given.
+    /// The dataset's path: in the folder from which the run was started, if it exists there, or else as given.
     pub fn scene_path(&self) -> PathBuf {
         let given = self.spec.start.scene.clone().unwrap_or_default();
-        let from_there = self.resolved.working_directory.as_ref().map(|folder| folder.join(&given));
-        from_there.filter(|path| path.exists()).unwrap_or(given)
+        let from_start = self.resolved.working_directory.as_ref().map(|folder| folder.join(&given));
+        from_start.filter(|path| path.exists()).unwrap_or(given)
     }
 }
 
@@ -274,15 +274,15 @@ pub(crate) mod tests {
     use densify_train::schedule::Background;
 
     #[test]
-    fn a_file_is_no_run() {
+    fn a_file_is_not_a_run() {
         let file = tempfile::NamedTempFile::new().unwrap();
         let message = RunConfig::read(file.path()).unwrap_err().to_string();
         assert!(message.contains("is neither a model nor a run; name a file"), "{message}");
-        // The end of an empty archive.
+        // An empty ZIP archive has only the record that ends archives.
         let empty = [&b"PK\x05\x06"[..], &[0; 18]].concat();
         std::fs::write(file.path(), empty).unwrap();
         let message = RunConfig::read(file.path()).unwrap_err().to_string();
-        assert!(message.contains("is a ZIP archive, but no SOG model; unpack"), "{message}");
+        assert!(message.contains("is a ZIP archive, but not a SOG model; unpack"), "{message}");
     }
 
     pub(crate) fn sample() -> RunConfig {

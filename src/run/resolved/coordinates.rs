@@ -1,4 +1,4 @@
-//! Tells the user before training if world coordinates will be too coarse in f32 for the Gaussians of a run.
+//! Tells the user before training if f32 will be too coarse for the world coordinates of the Gaussians.
 
 use super::case::{Case, Init};
 use super::models::read;
@@ -11,19 +11,19 @@ use densify_train::init;
 
 /// Size of a trained Gaussian relative to its size if as many Gaussians were spread evenly over the same surfaces.
 const TRAINED_SIZE: f64 = 0.5;
-/// Largest number of points that are used: with more, their spacing varies little.
+/// Maximum number of points from which sizes are estimated; more points would not change the estimate much.
 const MOST_POINTS: usize = 200_000;
 
-/// Random points for a run without any, seen by its training views.
+/// Random points that the training views see, for a run that starts from random points.
 pub(crate) fn random_points(case: &Case<'_>, count: usize) -> PointCloud {
     let train = &case.inputs.dataset.train;
     let cameras: Vec<_> = train.iter().map(|view| view.camera).collect();
-    let opaque = !train.iter().any(|view| view.source.header.has_alpha);
-    init::random_points(count, &cameras, opaque, case.spec.schedule.seed)
+    let is_opaque = !train.iter().any(|view| view.source.header.has_alpha);
+    init::random_points(count, &cameras, is_opaque, case.spec.schedule.seed)
 }
 
-/// A line about the coordinates of saved models; `None` if f32 holds world coordinates. A model that cannot be read is
-/// reported elsewhere.
+/// A line about the coordinates of saved models; `None` if f32 is fine enough for world coordinates. A model
+/// that cannot be read is reported elsewhere.
 pub(super) fn line(
     case: &Case<'_>,
     budget: usize,

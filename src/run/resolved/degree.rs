@@ -1,4 +1,4 @@
-//! `--sh-degree`: how colours may depend on the viewing direction.
+//! `--sh-degree`: the degree to which colours may depend on the viewing direction.
 
 use std::ops::RangeInclusive;
 
@@ -12,7 +12,7 @@ use densify_data::track_colours::{self, MIN_TRACKS};
 /// The degree of a run, before its memory is known.
 #[derive(Debug, Clone)]
 pub(crate) struct Degree {
-    /// From the lowest degree that memory may enforce, to the highest wanted.
+    /// From the lowest degree that the memory limit may enforce, to the degree that is wanted.
     pub(crate) range: RangeInclusive<u8>,
     pub(crate) source: DegreeSource,
 }
@@ -49,16 +49,16 @@ impl Degree {
         }
     }
 
-    /// Evidence of an automatic choice, for the user.
+    /// A line for the user with the evidence for an automatic choice.
     pub(super) fn line(&self) -> Option<String> {
         match self.source {
             DegreeSource::Given => None,
-            DegreeSource::Spread(found) => Some(format!(
+            DegreeSource::Spread(spread) => Some(format!(
                 "colour   degree {} (auto): the colour of a twentieth of {} points varies by {:.1}/255 or more \
                  between the views that see them",
                 self.highest(),
-                grouped(found.tracks),
-                found.twentieth,
+                grouped(spread.tracks),
+                spread.twentieth,
             )),
             DegreeSource::Undecided => Some(format!(
                 "colour   degree {} (auto): undecided, because fewer than {MIN_TRACKS} \

@@ -6,8 +6,8 @@ use crate::host::Host;
 use crate::spec::RunSpec;
 use densify_core::memory::Ledger;
 
-/// The rows and the ledger of a run whose models of `--init` and `--freeze` do not exist yet. Exposures are counted if
-/// they may be learned.
+/// The number of rows and the ledger of a run whose models of `--init` and `--freeze` do not exist yet. Exposures are
+/// counted if they may be learned.
 ///
 /// # Errors
 /// As preparing the run.

@@ -1,4 +1,4 @@
-//! `--exposure`: a separate exposure for each photograph.
+//! `--exposure`: whether to learn an exposure for each photograph, and the exposures to start with.
 
 use super::config::ExposureSource;
 use super::inputs::Evidence;
@@ -15,14 +15,14 @@ use densify_train::exposure::{ExposureChoice, Exposures};
 /// The exposures of a run.
 #[derive(Debug, Clone)]
 pub(crate) struct Exposure {
-    /// Exposures are learned.
+    /// True if exposures are learned.
     pub(crate) is_on: bool,
     pub(crate) source: ExposureSource,
     /// Initial gains of the training views; empty if all views start alike.
     gains: Vec<[f32; 3]>,
-    /// The gains come from the colours of tracks.
-    by_tracks: bool,
-    /// Use of the exposures in EXIF.
+    /// True if the gains come from the colours of tracks.
+    from_tracks: bool,
+    /// How the exposures in EXIF are used.
     exif_use: ExifUse,
     /// Standard deviation of the exposures in EXIF `[stops]`.
     reported: f64,
@@ -37,7 +37,7 @@ impl Exposure {
             is_on,
             source,
             gains: Vec::new(),
-            by_tracks: false,
+            from_tracks: false,
             exif_use: ExifUse::Unused,
             reported: 0.0,
             notes: Vec::new(),
@@ -52,61 +52,61 @@ impl Exposure {
         let measured = colours.map(ExposureSpread::measure);
         let decided = measured
             .as_ref()
-            .and_then(|(found, gains)| Some((found.decision(gains.len())?, *found)));
+            .and_then(|(spread, gains)| Some((spread.decision(gains.len())?, *spread)));
         let (is_on, source) = match spec.schedule.exposure {
             ExposureChoice::Off => (false, ExposureSource::Given),
             ExposureChoice::On => (true, ExposureSource::Given),
             ExposureChoice::Auto => {
-                let source = decided.map(|(_, found)| ExposureSource::Tracks(found));
+                let source = decided.map(|(_, spread)| ExposureSource::Tracks(spread));
                 let is_on = decided.is_some_and(|(differ, _)| differ);
                 (is_on, source.unwrap_or(ExposureSource::Undecided))
             }
         };
         let stops = spread(reported.stops.iter().copied().flatten());
-        let mut found = Self { reported: stops, ..Self::known(is_on, source) };
+        let mut exposure = Self { reported: stops, ..Self::known(is_on, source) };
         if !is_on {
-            return found;
+            return exposure;
         }
         let views = reported.stops.len();
         let known = match (measured, colours) {
             (Some((_, gains)), Some(colours)) if decided.is_some() => {
-                (found.gains, found.by_tracks) = (gains, true);
+                (exposure.gains, exposure.from_tracks) = (gains, true);
                 (0..views).map(|view| colours.knows(view)).collect()
             }
             _ => vec![false; views],
         };
-        found.gains.resize(views, [1.0; 3]);
-        found.exif_use = complete_gains(&mut found.gains, &known, &reported.stops);
-        if !found.by_tracks && found.exif_use == ExifUse::Unused {
-            found.gains.clear();
+        exposure.gains.resize(views, [1.0; 3]);
+        exposure.exif_use = complete_gains(&mut exposure.gains, &known, &reported.stops);
+        if !exposure.from_tracks && exposure.exif_use == ExifUse::Unused {
+            exposure.gains.clear();
         }
-        if let ExifUse::Contradicted { by } = found.exif_use {
-            found.notes.push(format!(
+        if let ExifUse::Contradicted { by } = exposure.exif_use {
+            exposure.notes.push(format!(
                 "the exposures in EXIF differ by {by:.1} stops (rms) from what the colours of points show, and are \
                  not used"
             ));
         }
         if let Some(example) = &reported.example {
-            found.notes.push(format!(
-                "nonsense in the EXIF of {} is not used ({example})",
+            exposure.notes.push(format!(
+                "implausible EXIF of {} is not used ({example})",
                 counted(reported.implausible, "photograph")
             ));
         }
-        found
+        exposure
     }
 
-    /// The exposures that the run starts with, if they are learned.
-    pub(crate) fn first(&self, spec: &RunSpec, dataset: &Dataset) -> Option<Exposures> {
+    /// The exposures that the run starts with, if exposures are learned.
+    pub(crate) fn initial(&self, spec: &RunSpec, dataset: &Dataset) -> Option<Exposures> {
         let alike = vec![[1.0; 3]; dataset.train.len()];
         let gains = if self.gains.is_empty() { &alike } else { &self.gains };
         self.is_on.then(|| Exposures::new(spec.schedule.exposure_model, gains))
     }
 
-    /// The choice and its evidence, for the user.
+    /// A line for the user with the choice and the evidence for it.
     pub(super) fn line(&self, spelling: Spelling) -> Option<String> {
         let word = if self.is_on { "on" } else { "off" };
         match self.source {
-            ExposureSource::Given if self.is_on => Some(match (self.by_tracks, self.exif_use) {
+            ExposureSource::Given if self.is_on => Some(match (self.from_tracks, self.exif_use) {
                 (true, _) => {
                     format!(
                         "exposure on, from the colours of points in several views{}",
@@ -119,14 +119,14 @@ impl Exposure {
                 (false, _) => "exposure on, initially the same for all views".to_owned(),
             }),
             ExposureSource::Given => None,
-            ExposureSource::Tracks(found) => Some(format!(
+            ExposureSource::Tracks(spread) => Some(format!(
                 "exposure {word} (auto): judged by the colours of {} points, the exposures of {} views differ by \
                  {:.2} stops (rms); with gains, colours differ by {:.1}/255 instead of {:.1}/255{}",
-                grouped(found.tracks),
-                found.views,
-                found.stops,
-                found.with_gains,
-                found.alike,
+                grouped(spread.tracks),
+                spread.views,
+                spread.stops,
+                spread.with_gains,
+                spread.alike,
                 self.exif_views(),
             )),
             ExposureSource::Undecided => Some(format!(
@@ -175,47 +175,47 @@ mod tests {
 
     #[test]
     fn without_tracks_exposures_start_from_exif() {
-        let found = decided(ExposureChoice::On, &two_stops_apart());
+        let exposure = decided(ExposureChoice::On, &two_stops_apart());
         assert_eq!(
-            found.line(Spelling::Terminal).as_deref(),
+            exposure.line(Spelling::Terminal).as_deref(),
             Some("exposure on, from the EXIF of 2 views")
         );
-        // A stop up and a stop down; the encoding raises light to the power 1/2.4.
+        // One stop above the mean, and one below; the encoding raises light to the power 1/2.4.
         let up = 2.0_f32.powf(1.0 / 2.4);
-        let begun = Exposures::new(ExposureModel::Channels, &found.gains);
+        let initial = Exposures::new(ExposureModel::Channels, &exposure.gains);
         for (view, gain) in [up, 1.0 / up, 1.0].into_iter().enumerate() {
-            let diagonal = begun.transform(view).matrix[1][1];
+            let diagonal = initial.transform(view).matrix[1][1];
             assert!((diagonal / gain - 1.0).abs() < 1e-5, "{view}: {diagonal} {gain}");
         }
-        let [note] = &found.notes[..] else { panic!("{:?}", found.notes) };
+        let [note] = &exposure.notes[..] else { panic!("{:?}", exposure.notes) };
         assert!(
             note.contains("EXIF of 1 photograph is not") && note.contains("c.jpg says"),
             "{note}"
         );
         // Without any EXIF, all views start alike.
         let nothing = ReportedExposures { stops: vec![None; 3], ..ReportedExposures::default() };
-        let found = decided(ExposureChoice::On, &nothing);
+        let exposure = decided(ExposureChoice::On, &nothing);
         assert_eq!(
-            found.line(Spelling::Terminal).as_deref(),
+            exposure.line(Spelling::Terminal).as_deref(),
             Some("exposure on, initially the same for all views")
         );
-        assert!(found.gains.is_empty() && found.notes.is_empty());
+        assert!(exposure.gains.is_empty() && exposure.notes.is_empty());
     }
 
     #[test]
     fn exif_alone_does_not_turn_exposures_on_but_is_reported() {
-        let found = decided(ExposureChoice::Auto, &two_stops_apart());
-        assert!(!found.is_on && found.gains.is_empty());
-        let line = found.line(Spelling::Terminal).unwrap();
+        let exposure = decided(ExposureChoice::Auto, &two_stops_apart());
+        assert!(!exposure.is_on && exposure.gains.is_empty());
+        let line = exposure.line(Spelling::Terminal).unwrap();
         assert!(line.contains("off (auto)") && line.contains("differ by 1.00 stops"), "{line}");
         assert!(line.contains("--exposure on"), "{line}");
         let alike =
             ReportedExposures { stops: vec![Some(-5.0); 3], ..ReportedExposures::default() };
         let line = decided(ExposureChoice::Auto, &alike).line(Spelling::Terminal).unwrap();
         assert!(!line.contains("EXIF"), "{line}");
-        let found = decided(ExposureChoice::Off, &two_stops_apart());
+        let exposure = decided(ExposureChoice::Off, &two_stops_apart());
         assert_eq!(
-            (found.is_on, found.line(Spelling::Terminal), found.gains.len()),
+            (exposure.is_on, exposure.line(Spelling::Terminal), exposure.gains.len()),
             (false, None, 0)
         );
     }

@@ -11,7 +11,7 @@ pub(crate) struct GeometryMeasurement {
     pub(crate) device: Device,
     /// Setup of the backend, for any number of rows.
     pub(crate) setup: Setup,
-    /// Threads that measure.
+    /// Number of threads that measure.
     pub(crate) threads: usize,
     /// Memory of the known surface `[bytes]`.
     pub(crate) surface: u64,
@@ -30,7 +30,7 @@ impl GeometryMeasurement {
         counted
     }
 
-    /// Memory for measuring in addition to the process, on the host and on the device `[bytes]`.
+    /// Memory for measuring on the host, in addition to that of the process, and on the device `[bytes]`.
     pub(crate) fn bytes(&self, rows: usize, sh_degree: u8) -> [u64; 2] {
         let setup = self.for_rows(rows);
         let plan = self.device.memory_plan(sh_degree, &setup, self.threads);
@@ -41,7 +41,7 @@ impl GeometryMeasurement {
     /// The backend for a model of this many rows.
     pub(crate) fn for_rows(&self, rows: usize) -> Setup {
         let rows = rows.max(1);
-        // Few views have more than three pairs per row; these are rendered in bands, with the same result.
+        // Few views have more than three pairs per row; those that do are rendered in bands, with the same result.
         let pairs = rows.saturating_mul(3).min(self.device.most_pairs(&self.setup.needs));
         let cap = self.setup.tile_cap.map_or(pairs, |cap| cap.min(pairs));
         Setup {

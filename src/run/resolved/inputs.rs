@@ -21,7 +21,7 @@ pub(crate) struct Inputs {
     pub(crate) device: Device,
     /// The dataset without its tracks, which are part of the [`Evidence`].
     pub(crate) dataset: Dataset,
-    /// The memory that training and test images take.
+    /// The memory that the images of the training and of the test views take.
     pub(crate) images: [ImageDemand; 2],
     /// File and size of the model of `--init`, if there is one.
     pub(super) init_file: Option<AbsolutePath>,
@@ -62,8 +62,8 @@ pub(super) struct Reading {
     pub(super) colours: bool,
     /// Read the exposures in EXIF.
     pub(super) exif: bool,
-    /// Bytes of resident memory not counted, so that a resumed run is not refused because its process takes a little
-    /// more than the one that started the run.
+    /// Resident memory that is not counted `[bytes]`, so that a resumed run is not refused because its process takes a
+    /// little more than the process that started the run.
     pub(super) tolerance: u64,
 }
 
@@ -120,14 +120,14 @@ impl Inputs {
         Ok((inputs, Evidence { tracks, colours, reported }))
     }
 
-    /// The same inputs with the photographs in another resolution.
+    /// The same inputs with the photographs at the resolution of `spec`.
     pub(super) fn at_resolution_of(&self, spec: &RunSpec) -> Result<Self, Failure> {
         let dataset = Dataset::load(spec.scene()?, &spec.data.load_options(false))?;
         Ok(Self { images: image_demand(&dataset), dataset, ..self.clone() })
     }
 }
 
-/// The memory that training and test images take.
+/// The memory that the images of the training and of the test views take.
 fn image_demand(dataset: &Dataset) -> [ImageDemand; 2] {
     let demand = |views: &[View]| ImageDemand::total(views.iter().map(|view| &view.source));
     [demand(&dataset.train), demand(&dataset.test)]

@@ -22,17 +22,17 @@ use densify_train::exposure::Exposures;
 use densify_train::metrics::{geometry, scratch_bytes};
 use densify_train::trainer::AutoChoices;
 
-/// The program itself: the code pages in use, and the stacks of its threads. Measured at 10 to 13 MiB, and at about 14
-/// MiB in builds for tests (profile `dev`).
+/// Memory of the program itself `[bytes]`: the code pages in use, and the stacks of its threads. Measured at 10 to 13
+/// MiB, and at about 14 MiB in builds for tests (profile `dev`).
 const PROGRAM: u64 = 16 << 20;
-/// If the process takes more, for example because of a driver, its actual memory counts, rounded up to a multiple of
-/// this so that the ledger does not change from call to call.
+/// If the process takes more than expected, for example because of a driver, its actual memory counts, rounded up to a
+/// multiple of this number so that the ledger does not change from call to call `[bytes]`.
 const PROGRAM_STEP: u64 = 8 << 20;
-/// Memory that the system's allocator keeps between two uses. Measured at up to 5 MiB.
+/// Memory that the system's allocator keeps between two uses `[bytes]`. Measured at up to 5 MiB.
 const ALLOCATOR_RESERVE: u64 = 6 << 20;
-/// Bytes per row that a policy derives from its signals before it plans: means, orders, sums of weights and random
-/// numbers. Columns of auxiliary views are counted twice, as policies derive as many values from them. Sorting rows
-/// afterwards takes no more than these bytes, which are free again by then.
+/// Bytes per row of the values that a policy derives from its signals before it plans: means, orders, sums of weights
+/// and random numbers. Columns of auxiliary views are counted twice, because policies derive as many values from them.
+/// Sorting rows afterwards takes no more than these bytes, which are free again by then.
 const PLANNING_BYTES: u64 = 20;
 /// Bytes per thread of both thread pools together: the used part of its stack, and the buffers that it keeps. Measured
 /// at 44 to 52 KiB with 64 to 256 threads.
@@ -161,17 +161,18 @@ impl Case<'_> {
             // Exposures need another copy of the colours, transformed by the exposure that fits best.
             let planes = if self.choices.exposure.is_on { 8 } else { 5 };
             let rendering = u64::from(width) * u64::from(height) * planes * float;
-            let one = |images: &ImageDemand| images.held(0) + images.decoding(1);
-            let tested = if measures_test { one(&test) } else { 0 };
-            let image = tested.max(if self.inputs.init_model.is_some() { one(&train) } else { 0 });
-            // Finding the least important rows takes the order of all rows, and besides it first two copies of their
+            let one_image = |images: &ImageDemand| images.held(0) + images.decoding(1);
+            let tested = if measures_test { one_image(&test) } else { 0 };
+            let image =
+                tested.max(if self.inputs.init_model.is_some() { one_image(&train) } else { 0 });
+            // Finding the least important rows takes the order of all rows, and in addition first two copies of their
             // opacities, then a plan.
             let row = float + (2 * float).max(bytes_per_row(&Needs::default()) as u64);
             let removal = if self.choices.automatic.rows { budget * row } else { 0 };
             // A copy of the exact means, while the model is measured with its means rounded as in the saved file.
-            let rounds = self.spec.output.coordinates == Coordinates::World
+            let rounds_means = self.spec.output.coordinates == Coordinates::World
                 && self.inputs.dataset.normalisation.is_remote();
-            let means = if rounds { 3 * float * budget } else { 0 };
+            let means = if rounds_means { 3 * float * budget } else { 0 };
             let other = scratch_bytes(width, threads) + removal + means;
             pass("measuring a view", rendering + image + other);
         }
@@ -216,9 +217,10 @@ impl Case<'_> {
         let float = size_of::<f32>() as u64;
         let candidate = size_of::<densify_policies::policy::Candidate>() as u64;
         let seed = size_of::<densify_policies::plan::Seed>() as u64;
-        // From the native backend, the policy reads the backend's own arrays of signals.
+        // With the native backend, the policy reads the backend's own arrays of signals.
         let signals = self.inputs.device.columns_on_host(needs.signals.width()) as u64;
-        // The columns of one auxiliary view, and as many that a policy derives from these; the points of all views.
+        // The columns of one auxiliary view, and as many columns that a policy derives from these; the points of all
+        // views.
         let aux = needs.aux.as_ref();
         let columns = aux.map_or(0, |request| 2 * request.columns.len()) as u64;
         let points = aux.map_or(0, |request| u64::from(request.points));

@@ -45,7 +45,7 @@ pub(crate) struct ResolvedRun<'a> {
     pub(crate) size: RunSize,
     /// The first Gaussians.
     pub(crate) init: Init,
-    /// `--memory` made the degree lower than requested.
+    /// True if `--memory` made the degree lower than requested.
     pub(crate) degree_lowered: bool,
     /// Lines for the user: the reasons for the size, and the choices that depend on the scene.
     pub(crate) reasons: Vec<String>,

@@ -36,7 +36,7 @@ pub(super) fn file_of(
     Ok(AbsolutePath(model_path(path, iteration)))
 }
 
-/// Rows and degree of the model in a file. Reads all of it, so that a damaged file is found before anything is decided.
+/// The size of the model in a file. Reads the whole file, so that damage is found before anything is decided.
 ///
 /// # Errors
 /// When the file holds no model, or one without rows. Names the option.
@@ -62,7 +62,7 @@ pub(crate) fn read(
     read_model(file, observer).map_err(|failure| failure.within_option(option, None))
 }
 
-/// Bytes of a model's rows as they are read.
+/// Bytes of a model's rows in memory, at the degree of its file.
 fn bytes_of(model: ModelSize) -> u64 {
     (model.rows * size_of::<f32>() * (11 + 3 * sh_coefficients(model.sh_degree))) as u64
 }
@@ -88,11 +88,12 @@ pub(super) fn first_bytes(
     let backend = case.inputs.device.memory_plan(model.sh_degree, &setup, threads).on_host();
     let [train, _] = case.inputs.images;
     let image = train.held(0) + train.decoding(1);
-    // The model together with its copy in the backend, and then with the rows that are kept.
+    // While importance is measured, the model and its copy in the backend exist; the rows that are then kept take less
+    // than that copy.
     reading.max(bytes_of(model) + backend + image + densify_train::importance::bytes(model.rows))
 }
 
-/// The backend that measures the importance of this many rows.
+/// The setup of the backend that measures the importance of this many rows.
 pub(crate) fn importance_setup(rows: usize, case: &Case<'_>, size: &RunSize) -> Setup {
     let needs = needs();
     let pairs = rows.saturating_mul(PAIRS_PER_ROW).min(case.inputs.device.most_pairs(&needs));

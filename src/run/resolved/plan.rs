@@ -16,9 +16,9 @@ use densify_data::dataset::Resolution;
 /// The size and memory of a run.
 #[derive(Debug, Clone)]
 pub struct Plan {
-    /// Bytes per buffer.
+    /// The bytes of every buffer.
     pub ledger: Ledger,
-    /// The size with the reasons for it, and the ledger, for the user.
+    /// Lines for the user: the size with the reasons for it, and the ledger.
     pub lines: Vec<String>,
     /// Other sizes that fit the same memory.
     pub alternatives: Alternatives,
@@ -93,7 +93,7 @@ fn alternatives(case: &Case<'_>, memory: u64, planned: usize) -> Result<Alternat
 impl fmt::Display for Alternatives {
     /// A table for a terminal.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        // In a form that can be typed, without rounding.
+        // In a form that users can type, without rounding.
         let memory = match self.memory % MIB {
             0 => format!("{}MiB", self.memory / MIB),
             _ => self.memory.to_string(),

@@ -1,4 +1,4 @@
-//! Changes of the options that were checked to make a run fit, cheapest first.
+//! Changes of the options that make a run fit, each verified, cheapest first.
 
 use super::case::Case;
 use super::size::MIB;
@@ -9,14 +9,14 @@ use densify_data::dataset::Resolution;
 use densify_render::BackendKind;
 
 /// The preset for runs that are short of memory.
-const SMALL: &str = "tiny-memory";
+const TINY_MEMORY: &str = "tiny-memory";
 
 impl Remedy {
-    /// Changes for new runs, cheapest first: they cost time, then view-dependent colours, then detail.
-    pub(super) const NEW: [Self; 7] = [
+    /// Changes for new runs, cheapest first: the first cost time, the next view-dependent colours, the last detail.
+    pub(super) const NEW_RUN: [Self; 7] = [
         Self::NoImages,
         Self::NoTileCap,
-        Self::Preset(SMALL),
+        Self::Preset(TINY_MEMORY),
         Self::LeastDegree,
         Self::Shrink(2),
         Self::Shrink(4),
@@ -59,8 +59,8 @@ fn with_preset(preset: &str, spec: &RunSpec) -> Option<RunSpec> {
     Partial::option("preset", preset).over(given).describe().ok()
 }
 
-/// Each change that alone makes the run fit; if there is none, the shortest sequence of the first changes that does. Of
-/// several smaller image sizes, only the largest that fits is listed.
+/// Each change that makes the run fit by itself; if there is none, the shortest sequence of the first `changes` that
+/// makes it fit. Of several smaller image sizes, only the largest that fits is listed.
 pub(super) fn remedies(
     case: &Case<'_>,
     base: &RunSpec,
@@ -71,23 +71,23 @@ pub(super) fn remedies(
     // A change that cannot be tried is no remedy.
     let is_remedy = |spec: &RunSpec| case.with(spec).and_then(|case| fits(&case)).unwrap_or(false);
     let shrinks = |change: &Remedy| matches!(change, Remedy::Shrink(_));
-    let mut found = Vec::new();
+    let mut singles = Vec::new();
     let mut together = (Vec::new(), base.clone());
     let (mut is_shrunk, mut joint) = (false, None);
     for &change in changes {
         let alone = change.apply(base, kind).filter(|_| !(shrinks(&change) && is_shrunk));
         if alone.is_some_and(|spec| is_remedy(&spec)) {
-            found.push(vec![change]);
+            singles.push(vec![change]);
             is_shrunk |= shrinks(&change);
         }
         if let Some(spec) = change.apply(&together.1, kind) {
             together.0.retain(|other| !(shrinks(&change) && shrinks(other)));
             together.0.push(change);
             together.1 = spec;
-            if found.is_empty() && joint.is_none() && is_remedy(&together.1) {
+            if singles.is_empty() && joint.is_none() && is_remedy(&together.1) {
                 joint = Some(together.0.clone());
             }
         }
     }
-    if found.is_empty() { joint.into_iter().collect() } else { found }
+    if singles.is_empty() { joint.into_iter().collect() } else { singles }
 }

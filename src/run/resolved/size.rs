@@ -16,8 +16,8 @@ use densify_core::spelling::Spelling;
 use densify_data::dataset::Resolution;
 use densify_render::BackendKind;
 
-/// Default of `--budget`: such a model trains on a laptop in well under 2 GiB, and is enough for a room or an object;
-/// large outdoor scenes need more.
+/// Default of `--budget`: a model of this size trains on a laptop in well under 2 GiB, and is enough for a room or an
+/// object; large outdoor scenes need more.
 pub const DEFAULT_BUDGET: usize = 200_000;
 /// Memory for decoded photographs without `--image-cache` `[bytes]`.
 const DEFAULT_IMAGE_CACHE: u64 = 1 << 30;
@@ -71,7 +71,7 @@ impl Size {
     /// Takes the size from the options, or the largest that `--memory` allows.
     ///
     /// # Errors
-    /// When nothing fits; lists changes of the options after which it does.
+    /// When no size fits; the error lists changes of the options after which one does.
     pub(super) fn choose(case: &Case<'_>) -> Result<Self, Failure> {
         let Some(size) = solve(case)? else {
             return Err(no_size_error(case, &request(case, case.memory().unwrap_or(0))?)?);
@@ -89,7 +89,7 @@ impl Size {
         self.run_size.sh_degree < case.choices.degree.highest()
     }
 
-    /// The size and the reason for it, for the user.
+    /// Lines for the user about the size and the reason for it.
     pub(super) fn lines(&self, case: &Case<'_>, spelling: Spelling) -> Vec<String> {
         let RunSize { rows, sh_degree, tile_cap, image_cache, .. } = self.run_size;
         let solved = self.solved.as_ref();
@@ -137,7 +137,7 @@ impl Case<'_> {
         self.rows_for(MIN_ROWS)
     }
 
-    /// The budget, if it is a number.
+    /// The limit that the user set on the number of rows, if any.
     fn asked_budget(&self) -> Option<usize> {
         self.spec.size.budget.and_then(Budget::most)
     }
@@ -150,7 +150,7 @@ impl Case<'_> {
         self.spec.size.tile_cap.map(|pairs| pairs.0)
     }
 
-    /// Bytes of decoded photographs, if a number is given.
+    /// Bytes for decoded photographs, if the user gave a number.
     fn image_cache(&self) -> Option<u64> {
         match self.spec.size.image_cache? {
             ImageCache::Bytes(bytes) => Some(bytes),
@@ -187,7 +187,7 @@ impl ResolvedRun<'_> {
         let Self { case, size, .. } = self;
         let ledger = case.ledger_of(size)?;
         let granted = (process.grant)(case.choices.threads + DECODERS + TEST_DECODERS);
-        let (Some(MemoryLimit { left, by }), Some(now)) = (granted, (process.resident)()) else {
+        let (Some(MemoryLimit { left, name }), Some(now)) = (granted, (process.resident)()) else {
             return Ok(());
         };
         let more = ledger.on_host().saturating_sub(now);
@@ -207,19 +207,19 @@ impl ResolvedRun<'_> {
                 base.size.memory = Some(ByteCount(most / MIB * MIB));
                 Remedy::Memory(most / MIB)
             });
-        let mut found = if is_resumed {
+        let mut fixes = if is_resumed {
             Vec::new()
         } else if lower_limit.is_some()
             && case.with(&base).and_then(|case| on_host(&case)).unwrap_or(false)
         {
             vec![Vec::new()]
         } else {
-            remedies(case, &base, &Remedy::NEW, on_host)
+            remedies(case, &base, &Remedy::NEW_RUN, on_host)
         };
-        found.iter_mut().for_each(|changes| changes.splice(0..0, lower_limit).for_each(drop));
+        fixes.iter_mut().for_each(|changes| changes.splice(0..0, lower_limit).for_each(drop));
         let needed = ledger.on_host();
         let problem =
-            SizeProblem::OverGrant { needed, resident: now, limit: by, left, remedies: found };
+            SizeProblem::OverGrant { needed, resident: now, limit: name, left, remedies: fixes };
         Err(Failure::with_code(DEVICE, problem))
     }
 }
@@ -239,8 +239,8 @@ pub(super) fn solve(case: &Case<'_>) -> Result<Option<Size>, Failure> {
     Ok(fit.map(|fit| Size { run_size: fit.size, solved: Some((memory, fit)) }))
 }
 
-/// The number of rows that fit in `memory` at this degree, ignoring the budget; at least the smaller of [`MIN_ROWS`]
-/// and `planned`, or `None`.
+/// The number of rows that fit in `memory` at this degree, ignoring the budget; `None` if it is below both [`MIN_ROWS`]
+/// and `planned`.
 pub(super) fn rows_at(
     case: &Case<'_>,
     memory: u64,
@@ -258,7 +258,7 @@ pub(super) fn rows_at(
 }
 
 /// The fewest bytes for a run of these rows and this degree: with the shortest tile lists, and without a cache of
-/// decoded images unless one is given. What a larger size takes beyond them is for speed.
+/// decoded images unless its size is given. Any further bytes of the run only make it faster.
 pub(super) fn needed_bytes(case: &Case<'_>, size: &RunSize) -> Result<u64, Failure> {
     let request = request(case, u64::MAX)?;
     let request = SizeRequest { image_cache: Some(case.image_cache().unwrap_or(0)), ..request };
@@ -297,8 +297,8 @@ fn max_pairs(case: &Case<'_>, rows: usize) -> Result<usize, Failure> {
     Ok(case.inputs.device.most_pairs(&case.needs(rows)?))
 }
 
-/// The error if not even the smallest model fits: the memory that it takes, and option changes that were checked to
-/// make it fit.
+/// The error if not even the smallest model fits: the memory that it takes, and verified changes of options with which
+/// a model fits.
 fn no_size_error(case: &Case<'_>, request: &SizeRequest) -> Result<Failure, Failure> {
     let rows = case.min_rows().min(request.max_rows);
     let degree = *request.sh_degree.start();
@@ -306,12 +306,12 @@ fn no_size_error(case: &Case<'_>, request: &SizeRequest) -> Result<Failure, Fail
     let Some(least) = min_memory(request, MIB, |size| bytes(case, size))? else {
         return Ok(SizeProblem::NoSize { memory }.into());
     };
-    let mut remedies = remedies(case, case.spec, &Remedy::NEW, |case| Ok(solve(case)?.is_some()));
+    let mut fixes = remedies(case, case.spec, &Remedy::NEW_RUN, |case| Ok(solve(case)?.is_some()));
     let fewer = SizeRequest { min_rows: case.rows_for(1), ..request.clone() };
     if let Some(fewer) = fit(&fewer, |size| bytes(case, size))? {
-        remedies.push(vec![Remedy::Budget(fewer.size.rows)]);
+        fixes.push(vec![Remedy::Budget(fewer.size.rows)]);
     }
     let needed = least / MIB;
-    remedies.push(vec![Remedy::Memory(needed)]);
-    Ok(SizeProblem::NoModelFits { memory, rows, sh_degree: degree, needed, remedies }.into())
+    fixes.push(vec![Remedy::Memory(needed)]);
+    Ok(SizeProblem::NoModelFits { memory, rows, sh_degree: degree, needed, remedies: fixes }.into())
 }

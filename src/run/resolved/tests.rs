@@ -1,5 +1,5 @@
-//! Sizes and bytes agree in both directions: the memory of a number of rows fits at least as many, and the rows that
-//! fit a memory limit take no more than it.
+//! Sizes and bytes agree in both directions: the memory that some rows take has room for at least as many rows, and the
+//! rows that fit a memory limit take no more than the limit.
 
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 
@@ -24,7 +24,7 @@ fn described(options: &[(&str, toml::Value)]) -> RunSpec {
     options.iter().fold(Partial::default(), add).describe().expect("a run")
 }
 
-/// Rows of a run, and its bytes that `--memory` limits.
+/// The rows of a run, and those of its bytes that `--memory` limits.
 fn sized(case: &Case<'_>) -> (usize, u64) {
     let run_size = size::solve(case).expect("it is solved").expect("it fits").run_size;
     let ledger = case.ledger_of(&run_size).expect("a ledger");
@@ -47,9 +47,9 @@ fn check(case: &Case<'_>, rows: usize) -> Result<(), TestCaseError> {
     for memory in [bytes, bytes + bytes / 3] {
         let most = size::rows_at(case, memory, 3, rows).expect("it is solved").expect("it fits");
         for asked in [rows, most] {
-            let (found, taken) = sized_for(asked, Some(ByteCount(memory)));
-            prop_assert!(taken <= memory, "{found} rows take {taken} of {memory}");
-            prop_assert_eq!(found, asked, "{} bytes", memory);
+            let (rows, taken) = sized_for(asked, Some(ByteCount(memory)));
+            prop_assert!(taken <= memory, "{rows} rows take {taken} of {memory}");
+            prop_assert_eq!(rows, asked, "{} bytes", memory);
         }
     }
     Ok(())
@@ -106,8 +106,8 @@ fn unused_features_of_photographs_take_no_memory() {
     // Update this number if a change is meant to make a run take more or less.
     assert_eq!(total, 34_785_170, "{plain:#?}");
     let differing = |other: &[(Section, String, u64)]| {
-        let found = other.iter().filter(|line| !plain.contains(line));
-        found.map(|(_, what, _)| what.clone()).collect::<Vec<_>>()
+        let lines = other.iter().filter(|line| !plain.contains(line));
+        lines.map(|(_, what, _)| what.clone()).collect::<Vec<_>>()
     };
     // No track is known in enough views, so `auto` decides against exposures.
     let auto = differing(&plain_ledger(&made, "auto").0);

@@ -7,7 +7,7 @@ use densify_core::pieces::pieces;
 use densify_data::models::{Coarseness, Coordinates, Frame};
 
 impl Session<'_> {
-    /// The coordinates of the file that is saved now, and how coarse they are if the file will be worse than the model.
+    /// The coordinates of the file that is saved next, and their coarseness if it makes the file worse than the model.
     /// Tells the user once if world coordinates are too coarse.
     pub(super) fn choose_frame(&mut self) -> Result<(Frame, Option<Coarseness>), Failure> {
         let to_world = self.run.dataset.normalisation;
@@ -45,7 +45,7 @@ impl Session<'_> {
         Ok(if is_automatic { (local, None) } else { (Frame::WORLD, Some(coarseness)) })
     }
 
-    /// Rounds the means as the saved file does, if that makes a difference, so that the quality of the file is
+    /// Rounds the means as in the saved file, if the rounding makes a difference, so that the quality of the file is
     /// measured. Returns the exact means, to be [restored](Self::restore_means).
     pub(super) fn round_means_as_saved(&mut self) -> Result<Option<Vec<f32>>, Failure> {
         if self.run.spec.output.coordinates != Coordinates::World

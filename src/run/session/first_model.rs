@@ -1,4 +1,4 @@
-//! The model that a run starts from, in the coordinates of training.
+//! The model that a run starts from, in normalised scene coordinates.
 
 use std::path::Path;
 
@@ -21,9 +21,10 @@ use densify_train::evaluate::Split;
 use densify_train::importance::{importance, largest};
 use densify_train::init::initialise;
 
-/// Minimum share of Gaussians in the training views; a model with less counts as being in other coordinates.
+/// Minimum share of a model's Gaussians that must lie in training views; below it, the model counts as being in other
+/// coordinates.
 const LEAST_IN_VIEW: f64 = 0.1;
-/// Depth, in extents of the scene, beyond which nothing counts as in view, because far away every point is in front of
+/// Depth `[extents of the scene]` beyond which nothing counts as in view, because far away every point is in front of
 /// some camera.
 const FARTHEST: f64 = 100.0;
 
@@ -114,7 +115,7 @@ fn with_degree(model: Gaussians, degree: u8, observer: &dyn Observer) -> Gaussia
     model.with_degree(degree)
 }
 
-/// Appends a model to that of `--freeze`, if there is one.
+/// Appends `others` to the model of `--freeze`, if there is one.
 ///
 /// # Errors
 /// When the file cannot be read or has changed, or its model lies in no training view.
@@ -156,8 +157,8 @@ fn in_view(model: &Gaussians, dataset: &Dataset) -> usize {
     model.means.par_iter().filter(|mean| shows(mean)).count()
 }
 
-/// Fails if the model of `--init` is in other coordinates than the photographs. Beside frozen Gaussians the model may
-/// be a small part of the scene, so that the user is then only told.
+/// Fails if the model of `--init` is in other coordinates than the dataset. Beside frozen Gaussians the model may be a
+/// small part of the scene; the user is then only told.
 ///
 /// # Errors
 /// When the model is in other coordinates, or a view cannot be read or rendered.

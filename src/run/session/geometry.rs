@@ -1,5 +1,5 @@
-//! Measures the model of a complete run against the known surface, as `densify eval` does, in a separate backend after
-//! that of training has been freed.
+//! Measures the model of a complete run against the known surface, as `densify eval` does. This takes a backend of its
+//! own, which is made after the backend of training has been freed.
 
 use std::path::Path;
 
@@ -16,7 +16,7 @@ use densify_train::output::{geometry_of, model_path, write_geometry};
 /// `folder` contains the run's model.
 ///
 /// # Errors
-/// When the files of the surface are damaged, or as [`geometry::measure`].
+/// When the files of the surface are damaged, or as [`Opened::geometry`].
 pub(super) fn measure(session: Session<'_>, folder: &Path) -> Result<(), Failure> {
     // The rest of the session keeps the folder locked.
     let (run, observer) = (session.run, session.observer);

@@ -38,7 +38,7 @@ use densify_train::trainer::{StepReport, TrainError};
 use geometry::measure;
 use records::{Logs, Totals};
 
-/// The file beside a model with the exposures of its training views.
+/// The file beside a model with the exposures of the training views.
 const EXPOSURES: &str = "exposure.json";
 /// Steps between two records of the log.
 const RECORD_EVERY: u32 = 10;
@@ -57,7 +57,7 @@ struct Session<'a> {
     guard: Guard,
     /// Step of the last checkpoint that this process has written or resumed from.
     checkpoint: Option<u32>,
-    /// The user was told about the coordinates of saved models.
+    /// True if the user has been told about the coordinates of saved models.
     has_told_coordinates: bool,
 }
 
@@ -92,9 +92,9 @@ fn train(run: Run, if_exists: Occupied, observer: &dyn Observer) -> Result<PathB
             return Err(error);
         }
     };
-    let done = session.run_steps();
+    let trained = session.run_steps();
     let guard = folder.guard();
-    let finished = done
+    let finished = trained
         .and_then(|()| guard.check().map_err(Failure::from))
         .and_then(|()| session.write_summary(true).map_err(Failure::from));
     match finished {
@@ -220,8 +220,8 @@ impl<'a> Session<'a> {
         }
     }
 
-    /// Writes a checkpoint. If it cannot be written, training continues: the run is worth more, and the previous
-    /// checkpoint still exists.
+    /// Writes a checkpoint. If that fails, training continues: the run is worth more than the checkpoint, and the
+    /// previous checkpoint still exists.
     fn try_checkpoint(&mut self) {
         let step = self.run.trainer.steps_done();
         let trouble = self.write_checkpoint().err().map(|error| {
@@ -244,9 +244,9 @@ impl<'a> Session<'a> {
         Err(Failure::with_code(OTHER, TrainingProblem::DrawsNothing { empty, views }))
     }
 
-    /// Saves the model, measures it and writes a checkpoint, each if it is due after `step`; in a resumed run, results
-    /// that exist are skipped.
-    fn save_and_measure_if_due(&mut self, step: u32, resumed: bool) -> Result<(), Failure> {
+    /// Saves the model, measures it and writes a checkpoint, each if it is due after `step`. If the run `is_resumed`,
+    /// results that exist are skipped.
+    fn save_and_measure_if_due(&mut self, step: u32, is_resumed: bool) -> Result<(), Failure> {
         let (output, is_last) = (&self.run.spec.output, step == self.run.last);
         let every = output.checkpoint_every;
         let due = every > 0 && (step.is_multiple_of(every) || is_last);
@@ -255,11 +255,11 @@ impl<'a> Session<'a> {
         if due || saves || tests {
             self.guard.check()?;
         }
-        let exists = |path: PathBuf| resumed && path.is_file();
+        let exists = |path: PathBuf| is_resumed && path.is_file();
         if saves && !exists(model_path(&self.folder, step)) {
             self.save(step)?;
         }
-        if tests && !(resumed && self.totals.tested.contains_key(&step)) {
+        if tests && !(is_resumed && self.totals.tested.contains_key(&step)) {
             self.test(step, is_last)?;
         }
         if due && !exists(checkpoint_path(&self.folder, step)) {
@@ -298,7 +298,7 @@ impl<'a> Session<'a> {
         self.with_checkpoint(Failure::with_code(exit_code, stopped))
     }
 
-    /// Writes a checkpoint of a run that ends with `failure`.
+    /// Writes a checkpoint of a run that ends with `failure`; the result also names an error in writing it.
     fn with_checkpoint(&mut self, failure: Failure) -> Failure {
         match self.write_checkpoint() {
             Ok(()) => failure,
@@ -329,8 +329,8 @@ impl<'a> Session<'a> {
                 Err(Failure::from(error).with(TrainingProblem::ModelSaved { saved }))
             }
             Err(error @ TrainError::NonFinite { .. }) => Err(self.with_checkpoint(error.into())),
-            // This photograph was readable earlier, so the run is worth saving. In the first epoch little would be
-            // lost.
+            // This photograph was readable in an earlier epoch, so the run is worth saving. In the first epoch, little
+            // would be lost.
             Err(error @ TrainError::View { step, .. })
                 if step > self.run.trainer.steps_done() && step as usize > train_views =>
             {

@@ -84,7 +84,7 @@ pub(super) fn prepare(
     }
     let options = train_options(&run, training.rates);
     let ResolvedRun { case, size, .. } = run;
-    let exposures = case.choices.exposure.first(spec, &case.inputs.dataset);
+    let exposures = case.choices.exposure.initial(spec, &case.inputs.dataset);
     let (name, automatic) = (case.choices.entry.name, case.choices.automatic);
     let mut dataset = case.inputs.into_owned().dataset;
     let views = DatasetViews::new(dataset.train.clone(), size.image_cache, DECODERS);
@@ -136,7 +136,7 @@ fn train_options(run: &ResolvedRun<'_>, rates: RateOptions) -> TrainOptions {
     }
 }
 
-/// Tells the user what was decided.
+/// Tells the user which choices were made.
 fn announce(
     run: &ResolvedRun<'_>,
     training: &ResolvedTraining,

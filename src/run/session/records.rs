@@ -13,7 +13,7 @@ use densify_core::files::FileError;
 use densify_render::StepOutput;
 use densify_train::output::{Mean, RecordLog, StepRecord, TensorBoard};
 
-/// Sums and scores so far.
+/// Sums and scores of the run so far.
 #[derive(Debug, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Totals {
@@ -24,12 +24,12 @@ pub(super) struct Totals {
     pub(super) cpu: Option<Duration>,
     /// Wall time by stage.
     pub(super) stages: BTreeMap<String, Duration>,
-    /// For each of the last N steps, with N training views: true if anything was rendered.
+    /// For each of the last steps, as many as there are training views: true if anything was rendered.
     #[serde(default)]
     pub(super) drawn: VecDeque<bool>,
     /// Scores of the test views, by step.
     pub(super) tested: BTreeMap<u32, Mean>,
-    /// Peak resident memory of earlier processes of this run.
+    /// Peak resident memory of earlier processes of this run `[bytes]`.
     peak_before: Option<u64>,
 }
 
@@ -90,7 +90,7 @@ impl Totals {
         }
     }
 
-    /// Peak resident memory of all processes of this run.
+    /// Peak resident memory of all processes of this run `[bytes]`.
     pub(super) fn peak_bytes(&self, process: ProcessMemory) -> Option<u64> {
         (process.peak)().max(self.peak_before)
     }

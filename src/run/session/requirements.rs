@@ -19,13 +19,13 @@ pub(super) const REQUIREMENTS: &str = "stats/requirements.json";
 /// The report on what a run required and what it left out.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Requirements {
-    /// Automatic reductions were disabled (`--full`).
+    /// True if automatic reductions were disabled (`--full`).
     pub full: bool,
     /// Spherical-harmonic degree of the model.
     pub sh_degree: u8,
     /// The reason for the degree.
     pub sh_degree_from: DegreeSource,
-    /// An exposure is learned for each photograph.
+    /// True if an exposure was learned for each photograph.
     pub exposures: bool,
     /// The reason for learning exposures or not.
     pub exposures_from: ExposureSource,
@@ -33,14 +33,14 @@ pub struct Requirements {
     pub rows: Option<AutoBudget>,
     /// Number of training views not rendered for scores because of near-duplicates.
     pub unscored_views: usize,
-    /// Automatic reductions, without those that the options ask for.
+    /// The automatic reductions; reductions that options ask for are not among them.
     pub left_out: Vec<LeftOut>,
 }
 
 /// The reductions in a `stats/requirements.json`.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 pub struct Reductions {
-    /// Automatic reductions were disabled.
+    /// True if automatic reductions were disabled.
     pub full: bool,
     /// The reductions.
     pub left_out: Vec<LeftOut>,
@@ -61,7 +61,7 @@ impl Reductions {
 pub struct LeftOut {
     /// The part of the model or of training that was left out.
     pub what: String,
-    /// The reason to consider it useless.
+    /// The reason for leaving it out.
     pub evidence: String,
     /// The measured loss of quality, with its method.
     pub loss: String,
@@ -126,28 +126,28 @@ fn degree_left_out(config: &RunConfig) -> Option<LeftOut> {
         });
     }
     // Any other degree below the highest was set by an option.
-    let DegreeSource::Spread(found) = config.resolved.sh_degree_from else { return None };
+    let DegreeSource::Spread(spread) = config.resolved.sh_degree_from else { return None };
     Some(LeftOut {
         what,
         evidence: format!(
             "the colour of a twentieth of {} points varies by {:.2}/255 or more between the views that see them",
-            found.tracks, found.twentieth
+            spread.tracks, spread.twentieth
         ),
         loss: format!(
             "the colours of all these points vary by {:.2}/255 (rms); with as many rows, degree 3 still gained \
              0.5 to 1.4 dB on matt scenes (docs/tradeoffs.md)",
-            found.rms
+            spread.rms
         ),
     })
 }
 
 fn exposures_left_out(config: &RunConfig) -> Option<LeftOut> {
-    let ExposureSource::Tracks(found) = config.resolved.exposure_from else { return None };
+    let ExposureSource::Tracks(spread) = config.resolved.exposure_from else { return None };
     (!config.resolved.has_exposures).then(|| LeftOut {
         what: "an exposure for each photograph".to_owned(),
         evidence: format!(
             "judged by the colours of {} points, the exposures of {} views differ by {:.2} stops (rms)",
-            found.tracks, found.views, found.stops
+            spread.tracks, spread.views, spread.stops
         ),
         loss: "its loss was not measured".to_owned(),
     })

@@ -20,7 +20,7 @@ use densify_train::trainer::Trainer;
 
 /// A run to resume.
 pub struct Resumed {
-    /// `None`: the run was stopped before its first checkpoint, and starts over.
+    /// The newest usable checkpoint; `None`: the run was stopped before its first checkpoint, and starts over.
     pub(super) checkpoint: Option<Checkpoint>,
     /// The configuration that was saved.
     pub(super) config: RunConfig,
@@ -29,13 +29,13 @@ pub struct Resumed {
 }
 
 impl Resumed {
-    /// The file with the saved description.
+    /// The file that contains the saved description.
     fn origin(&self, output: &Path) -> PathBuf {
         let config = || output.join(CONFIG_FILE);
         self.checkpoint.as_ref().map_or_else(config, |checkpoint| checkpoint.path().to_owned())
     }
 
-    /// Steps done.
+    /// Number of steps done.
     pub(super) fn step(&self) -> u32 {
         self.checkpoint.as_ref().map_or(0, |checkpoint| checkpoint.header().trainer.step)
     }
@@ -45,7 +45,7 @@ impl Resumed {
 const FREE_KNOBS: [&str; 2] = ["knob.pairs_per_row", "knob.accumulation"];
 
 /// Finds the newest usable checkpoint in the output folder of `given`, or else the configuration of a run without
-/// checkpoints, and overlays the saved options with `given`. Without either, the run is new.
+/// checkpoints, and overlays the saved options with `given`. If there is neither, the run is new.
 ///
 /// # Errors
 /// When a process is training in the folder, or the run in the folder cannot be resumed.
@@ -128,7 +128,7 @@ fn overlay(mut given: Partial, saved: &RunConfig, origin: &str) -> Result<RunSpe
     if given.get("deterministic").is_some() {
         lower = Partial::setting("accumulation", "auto").over(lower);
     }
-    // Two options split the dataset; the one given replaces the other.
+    // Either of two options splits the dataset; the one that is given replaces the other.
     if given.get("test_every").is_some() {
         lower.remove("eval");
     } else if given.get("eval").is_some() {
@@ -138,7 +138,7 @@ fn overlay(mut given: Partial, saved: &RunConfig, origin: &str) -> Result<RunSpe
         let name = given.get("preset").and_then(Value::as_str).unwrap_or_default();
         given = given.clone().over(Partial::preset(name)?);
     }
-    // Parameters of one policy mean nothing to another; a change of policy is refused later.
+    // Parameters of one policy mean nothing to another policy; a change of policy is refused later.
     if given.get("policy").is_some_and(|policy| policy.as_str() != Some(&saved.spec.density.policy))
     {
         lower.remove("policy_set");
@@ -192,7 +192,7 @@ pub(super) fn check(
     }
 }
 
-/// A difference in a key of [`fixed`], named by the option that sets the key.
+/// A difference in a key of [`fixed`], under the name of the option that sets the key.
 fn difference(key: &str, now: Option<&String>, then: Option<&String>) -> Difference {
     let (option, member) = key.split_once('.').unwrap_or((key, ""));
     let (option, member) = match member {
@@ -210,17 +210,17 @@ fn fixed(config: &RunConfig) -> Result<BTreeMap<String, String>, Failure> {
     table.retain(|name, _| {
         RunOption::find(name).is_some_and(|option| option.on_resume == OnResume::Fixed)
     });
-    let found =
+    let settings =
         assignments(&table).into_iter().map(|set| (set.path.join("."), set.value.to_string()));
-    let mut found: BTreeMap<_, _> = found.collect();
-    found.retain(|key, _| !FREE_KNOBS.contains(&&**key));
+    let mut settings: BTreeMap<_, _> = settings.collect();
+    settings.retain(|key, _| !FREE_KNOBS.contains(&&**key));
     let resolved =
         [("adapter", &config.resolved.adapter), ("accumulation", &config.resolved.accumulation)];
     for (name, value) in resolved {
         let value = value.clone().unwrap_or_else(|| "the processor".to_owned());
-        found.insert(format!("resolved.{name}"), value);
+        settings.insert(format!("resolved.{name}"), value);
     }
-    Ok(found)
+    Ok(settings)
 }
 
 /// Restores the trainer, which has as many rows as the checkpoint, and returns the state of the session; `None` without

@@ -30,9 +30,9 @@ pub struct Run {
     pub trainer: Trainer<DatasetViews>,
     /// The test views.
     pub(super) test: DatasetViews,
-    /// The dataset, thinned to as many points as the companion (such as the page of `--view`) asks for.
+    /// The dataset, with at most as many points as the companion (such as the page of `--view`) asks for.
     pub dataset: Dataset,
-    /// Planned bytes per buffer; the run takes no more.
+    /// The bytes of every buffer; the run takes no more than their sum.
     pub ledger: Ledger,
     /// The measurement against the known surface at the end, if there is such a surface.
     pub(super) geometry_measurement: Option<GeometryMeasurement>,
@@ -46,7 +46,7 @@ pub struct Run {
 }
 
 impl Run {
-    /// Prepares a new run: opens scene and device, decides its size, and makes the trainer. Nothing is written.
+    /// Prepares a new run: opens scene and device, decides the run's size, and makes the trainer. Nothing is written.
     ///
     /// # Errors
     /// When the description, one of its files or the device is unsuitable.
@@ -67,7 +67,7 @@ impl Run {
     }
 
     /// Trains to the end, writes nothing, and returns the model in the dataset's own coordinates. In a scene far from
-    /// the origin, these are local unless the description asks for world coordinates.
+    /// the origin, these coordinates are local unless the description asks for world coordinates.
     ///
     /// # Errors
     /// When a view cannot be read, the device fails, or the observer asks to stop.

@@ -47,7 +47,7 @@ impl Session<'_> {
         write_json(&self.folder.join("stats/summary.json"), &summary)
     }
 
-    /// The automatic reductions.
+    /// The report on what the run required, and its automatic reductions.
     fn requirements(&self) -> Requirements {
         let Run { config, trainer, .. } = &self.run;
         let growth = trainer.progress().auto_budget.as_ref();

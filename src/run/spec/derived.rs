@@ -57,10 +57,10 @@ impl RunSpec {
         Table::try_from(self).map_err(|error| Failure::input(error.to_string().trim()))
     }
 
-    /// The dataset.
+    /// The path of the dataset, or the name of a built-in scene.
     ///
     /// # Errors
-    /// When none is named.
+    /// When none is given.
     pub fn scene(&self) -> Result<&Path, Failure> {
         let scene = self.start.scene.as_deref();
         scene.ok_or_else(|| OptionProblem::NoScene.into())
@@ -84,29 +84,30 @@ impl RunSpec {
         Ok(Path::new("output").join(format!("{name}-{policy}")))
     }
 
-    /// The knobs.
+    /// All knobs, with the values that are set and the defaults of the others.
     ///
     /// # Errors
-    /// When there is no such knob, or its value is outside its domain.
+    /// When a name is not a knob, or its value is outside the knob's domain.
     pub fn knobs(&self) -> Result<Knobs, Failure> {
         let table = values::table(&self.schedule.knob)
             .map_err(|problem| OptionProblem::Conflict { option: "knob", problem })?;
         Knobs::from_table(&table).map_err(|error| OptionProblem::value("knob", error).into())
     }
 
-    /// The learning rates: the defaults for a run of this length, overlaid with those of the policy, those of positions
-    /// times `position_factor`, all reduced if the run starts from a model, and overlaid with `--lr`.
+    /// The learning rates: the defaults for a run of this length, overlaid with `policy_rates`. The rates of positions
+    /// are then multiplied by `position_factor`, and all are reduced if the run starts from a trained model. `--lr` is
+    /// overlaid last.
     ///
     /// # Errors
-    /// When there is no such rate, or its value is not allowed.
+    /// When a name in `--lr` is not a rate, or its value is not allowed.
     pub(crate) fn learning_rates(
         &self,
-        of_policy: &RateOverrides,
+        policy_rates: &RateOverrides,
         position_factor: f64,
     ) -> Result<RateOptions, Failure> {
         let fail = |problem: &str| Failure::from(OptionProblem::value("lr", problem.trim()));
         let iterations = self.schedule.iterations.0;
-        let mut defaults = RateOptions::for_run(iterations).with(of_policy);
+        let mut defaults = RateOptions::for_run(iterations).with(policy_rates);
         defaults.mean_start *= position_factor;
         defaults.mean_end *= position_factor;
         let is_model = matches!(self.start.init, Some(InitChoice::Model(_)));
@@ -134,7 +135,7 @@ impl RunSpec {
     /// The policy, and the parameters that are set for it.
     ///
     /// # Errors
-    /// When there is no such policy, or a parameter is set twice.
+    /// When the policy does not exist, or a parameter is set to two values.
     pub fn policy(&self) -> Result<(&'static PolicyEntry, Table), Failure> {
         let entry = find(&self.density.policy)?;
         let mut tables = values::table(&self.density.policy_set)
@@ -171,22 +172,22 @@ mod tests {
 
     #[test]
     fn learning_rates_are_set_by_name() {
-        let rates = |lr: &str, of_policy: &RateOverrides| {
+        let rates = |lr: &str, policy_rates: &RateOverrides| {
             let mut spec = spec("lr", lr).unwrap();
             spec.schedule.iterations.0 = 30_000;
-            spec.learning_rates(of_policy, 1.0).unwrap()
+            spec.learning_rates(policy_rates, 1.0).unwrap()
         };
         let given = rates("{ opacity = 0.05, mean_end = 1e-5 }", &RateOverrides::default());
         let expected = RateOptions { opacity: 0.05, mean_end: 1e-5, ..RateOptions::default() };
         assert_eq!(given, expected);
-        let of_policy = RateOverrides {
+        let policy_rates = RateOverrides {
             mean: Some(Rate { start: 1.6e-4, end: 3e-6 }),
             opacity: Some(Rate { start: 0.5, end: 0.25 }),
             sh_rest: Some(Rate::constant(2e-4)),
             fade: Some(Fade { from: 0.5, to: 0.25 }),
             ..RateOverrides::default()
         };
-        let both = rates("{ mean_end = 1e-5, opacity_end = 0.125 }", &of_policy);
+        let both = rates("{ mean_end = 1e-5, opacity_end = 0.125 }", &policy_rates);
         let expected = RateOptions {
             mean_end: 1e-5,
             opacity: 0.5,
@@ -241,8 +242,8 @@ mod tests {
         output.output.output = folder();
         for (option, spec) in [("SCENE", scene), ("--images", images), ("--output", output)] {
             let message = spec.table().unwrap_err().to_string();
-            let told = message.starts_with(option) && message.contains("rename the folder");
-            assert!(told, "{message}");
+            let is_named = message.starts_with(option) && message.contains("rename the folder");
+            assert!(is_named, "{message}");
         }
     }
 }

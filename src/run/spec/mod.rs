@@ -136,13 +136,13 @@ run_spec! {
         /// the others are left out
         views: Option<AbsolutePath> = None, Fixed, value "FILE";
 
-        /// Treatment of views whose camera is more than 10 times as far from the others as usual, if at most one view
-        /// in 20 has such a camera: structure from motion misplaces some
-        far_cameras: FarCameras = FarCameras::LeaveOut, Fixed, value "WHAT";
+        /// Treatment of views whose camera is more than 10 times farther out than the median camera, if at most one
+        /// camera in 20 is that far: structure from motion misplaces some cameras
+        far_cameras: FarCameras = FarCameras::LeaveOut, Fixed, value "ACTION";
 
         /// Keep the full field of view of a distorted lens, and mask pixels that the lens did not see; by default
         /// photographs are cropped to the largest rectangle without such pixels. Where the distortion folds over, the
-        /// invertible part is kept
+        /// part that can be undistorted is kept
         keep_fov: bool = false, Fixed, switch Set;
 
         /// Masks are white where photographs are to be ignored; by default black is ignored
@@ -155,8 +155,8 @@ run_spec! {
         /// Render a built-in scene again, and do not keep it in the user's cache folder
         no_cache: bool = false, Free, switch Set;
 
-        /// 1, 2, 4 or 8: photographs this many times smaller (uses images_2, images_4, images_8 if they exist); any
-        /// larger number: their width in pixels
+        /// Size of the photographs: 1, 2, 4 or 8 divides it (images_2, images_4, images_8 are read if they exist); any
+        /// larger number is the width in pixels
         #[arg(short)]
         resolution: Option<Resolution> = None, Fixed, value "N";
 
@@ -171,16 +171,15 @@ run_spec! {
         #[arg(value_name = "SCENE")]
         scene: Option<PathBuf> = None, Free;
 
-        /// Source of the first Gaussians: one on each of the dataset's points, random places, or a model in the
-        /// dataset's coordinates: a file by any program, or a run's folder (default: points if the dataset has any,
-        /// else random)
+        /// Source of the first Gaussians: the dataset's points, random points, or a model (a file by any program, or a
+        /// run's folder) in the dataset's coordinates (default: points if the dataset has any, else random)
         ///
         /// If the model has more Gaussians than the budget, those that contribute most to the training views are kept.
         /// Its colours are cut or extended to --sh-degree
         init: Option<InitChoice> = None, Fixed, value "points|random|MODEL";
 
-        /// Learning rates of a run from a model; --lr changes single rates
-        init_rates: InitRates = InitRates::Fine, Fixed, value "WHICH";
+        /// Learning rates of a run that starts from a model; --lr changes single rates
+        init_rates: InitRates = InitRates::Fine, Fixed, value "RATES";
 
         /// A model in the dataset's coordinates (a file by any program, or a run's folder) whose Gaussians are rendered
         /// but never change: they are neither trained, moved nor removed. The Gaussians of --init are trained beside
@@ -188,8 +187,8 @@ run_spec! {
         freeze: Option<AbsolutePath> = None, Fixed, value "MODEL";
 
         /// Lower the opacity of Gaussians smaller than a pixel, to make up for the kernel (0.3 or 0.1 px²) that widens
-        /// them, so that the model also suits other resolutions; none: no antialiasing (default: as the model of --init
-        /// or --freeze, else none; without KERNEL: 0.3)
+        /// them, so that the model also suits other resolutions; none: no antialiasing (default: that of the model of
+        /// --init or --freeze, else none; without KERNEL: 0.3)
         #[arg(num_args = 0..=1, require_equals = true, default_missing_value = "0.3")]
         antialias: Option<Antialiasing> = None, Fixed, value "KERNEL";
 
@@ -205,9 +204,9 @@ run_spec! {
     size: SizeSpec, "Size" {
         /// Maximum number of Gaussians in the model: 200000, 28k, 1.5M (default: 200k, or as many as --memory holds)
         ///
-        /// auto: growth stops where twice as many Gaussians gain less than 0.10 dB on training
-        /// views, and Gaussians with the least effect are then pruned. The limit is still the default;
-        /// auto:50k sets another limit
+        /// auto: growth stops when doubling the number of Gaussians gains less than 0.10 dB on
+        /// training views; Gaussians with the least effect are then pruned. The limit is still the
+        /// default; auto:50k sets another limit
         #[arg(short)]
         budget: Option<Budget> = None, Fixed, value "ROWS";
 
@@ -216,18 +215,18 @@ run_spec! {
         ///
         /// Options that are given are kept: --budget (the smaller of the two limits applies), --sh-degree, --tile-cap,
         /// --image-cache. The others are chosen: as many Gaussians as fit; degree 3, or a lower one if at degree 3
-        /// fewer fit than the scene starts with; decoded photographs take at most an eighth, and those that do not fit
-        /// in it are decoded again; tile lists hold 4 pairs per Gaussian, up to 16 where --budget leaves room. `densify
-        /// plan` shows the result
+        /// fewer fit than the scene starts with; decoded photographs take at most an eighth of the memory, and those
+        /// that do not fit into it are decoded again; tile lists hold 4 pairs per Gaussian, up to 16 where --budget
+        /// leaves room. `densify plan` shows the result
         memory: Option<ByteCount> = None, Fixed, value "BYTES";
 
         /// Maximum number of (Gaussian, tile) pairs in memory; views with more are processed in bands, which is exact
         /// but slower (default: 16 per Gaussian of the budget, or chosen for --memory)
         tile_cap: Option<Rows> = None, Free, value "PAIRS";
 
-        /// Memory for decoded photographs, and the same amount on a GPU; others are decoded and uploaded again when
-        /// they are needed. auto: an eighth of the memory of the run, plus what is left of --memory; 1GiB if --memory
-        /// limits a GPU (default: 1GiB, or as auto with --memory)
+        /// Memory for decoded photographs, and the same amount on a GPU; the other photographs are decoded and uploaded
+        /// again when they are needed. auto: an eighth of the memory of the run, plus what is left of --memory; 1GiB if
+        /// --memory limits a GPU (default: 1GiB, or auto with --memory)
         image_cache: Option<ImageCache> = None, Free, value "BYTES";
 
         /// Dependence of colours on the viewing direction: 0 none, 3 most; auto: as much as the scene requires
@@ -264,9 +263,9 @@ run_spec! {
         seed: u64 = 0, Fixed, value "N";
 
         /// Set a learning rate: mean_start, mean_end, log_scale, quat, opacity, sh_dc, sh_rest; for all but the means
-        /// also NAME_end; fade: final factor of opacity, sh_dc and sh_rest, which starts to act after the share
-        /// fade_from of the run; boost: initial factor of all (1 for runs of 30,000). A rate of 0 freezes its values.
-        /// May be repeated
+        /// also NAME_end; fade: final factor of opacity, sh_dc and sh_rest, which sets in after the share fade_from of
+        /// the run; boost: initial factor of all rates (1 in runs of 30,000 iterations). A rate of 0 freezes its
+        /// values. May be repeated
         #[serde(with = "as_table")]
         lr: Vec<Assignment> = Vec::new(), Fixed, value "NAME=RATE";
 
@@ -274,8 +273,8 @@ run_spec! {
         /// the preset (default: balanced)
         preset: Option<String> = None, Free, value "NAME";
 
-        /// Set a knob of the trade-off between speed, memory and accuracy, such as alpha_min=1/128; `densify knobs`
-        /// lists them. May be repeated
+        /// Set a knob, which trades accuracy for speed or memory, such as alpha_min=1/128; `densify knobs` lists them.
+        /// May be repeated
         #[serde(with = "as_table")]
         knob: Vec<Assignment> = Vec::new(), Fixed, value "NAME=VALUE";
 
@@ -284,7 +283,7 @@ run_spec! {
         /// reconstruction
         exposure: ExposureChoice = ExposureChoice::Off, Fixed, value "WHEN";
 
-        /// Form of an exposure
+        /// Form of the learned exposures
         exposure_model: ExposureModel = ExposureModel::Channels, Fixed, value "MODEL";
 
         /// Treatment of Gaussians with a non-finite value; the model is checked at least every 100 iterations
@@ -298,10 +297,10 @@ run_spec! {
 
     /// The device.
     device: DeviceSpec, "Backend" {
-        /// Where to compute
-        backend: BackendChoice = BackendChoice::Auto, Free, value "WHERE";
+        /// Backend to compute on
+        backend: BackendChoice = BackendChoice::Auto, Free, value "BACKEND";
 
-        /// The adapter to compute on, by part of its name; `densify devices` lists them
+        /// GPU adapter to compute on, by part of its name; `densify devices` lists them
         /// (default: the best)
         gpu: Option<String> = None, Free, value "NAME";
 

@@ -93,7 +93,7 @@ impl Partial {
         Self([(name.to_owned(), value.into())].into_iter().collect())
     }
 
-    /// The levels of a preset.
+    /// The options and knobs that a preset sets.
     ///
     /// # Errors
     /// When there is no such preset.
@@ -105,7 +105,7 @@ impl Partial {
             .fold(Self::default(), |all, (name, value)| Self::setting(name, value).over(all)))
     }
 
-    /// An option, or else a knob, by name and with its value as text.
+    /// An option of this name, or else a knob, with its value as text.
     pub fn setting(name: &str, value: &str) -> Self {
         let value = parse_value(value);
         match RunOption::find(name) {
@@ -114,7 +114,7 @@ impl Partial {
         }
     }
 
-    /// Overlays other options with these, which win; tables are joined key by key.
+    /// Overlays `lower` with these options, which win; tables are joined key by key.
     #[must_use]
     pub fn over(self, mut lower: Self) -> Self {
         join(self.0, &mut lower.0);
@@ -136,7 +136,7 @@ impl Partial {
         self.0.iter().map(|(name, value)| (&**name, value))
     }
 
-    /// True if a file with this table describes the same options.
+    /// True if a file with this table has the same options and values.
     pub fn is_table(&self, table: &Table) -> bool {
         self.0 == *table
     }
@@ -146,7 +146,7 @@ impl Partial {
         self.0
     }
 
-    /// The run that these options describe, over their preset (`balanced` if they name none) and the defaults.
+    /// The run that these options describe, overlaid on their preset (`balanced` if they name none) and the defaults.
     ///
     /// # Errors
     /// When the preset does not exist.
@@ -156,7 +156,7 @@ impl Partial {
         self.over(preset).spec()
     }
 
-    /// The run that these options describe, over the defaults.
+    /// The run that these options describe, overlaid on the defaults.
     pub(crate) fn spec(self) -> Result<RunSpec, Failure> {
         RunSpec::deserialize(self.0).map_err(Failure::input)
     }

@@ -35,7 +35,7 @@ pub struct Fraction(pub f64);
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 pub struct Whole<const LEAST: u32, const MOST: u32>(pub u32);
 
-/// A number of processor threads. More threads than the cores of a large machine would only waste their stacks.
+/// A number of processor threads. More threads than a large machine has cores would only take memory for stacks.
 pub type Threads = Whole<1, 256>;
 
 /// `--budget`: the maximum number of Gaussians, or `auto`.
@@ -43,13 +43,13 @@ pub type Threads = Whole<1, 256>;
 pub enum Budget {
     /// At most this many.
     Rows(usize),
-    /// As many as improve the model, up to this limit (`auto:50k`); `auto` alone: up to the default, or as many as
-    /// `--memory` holds.
+    /// As many as improve the model, up to this limit (`auto:50k`); `auto` alone: up to the default limit, or as many
+    /// as `--memory` holds.
     Auto(Option<usize>),
 }
 
 impl Budget {
-    /// The limit, if it is a number.
+    /// The limit, if one is given.
     pub fn most(self) -> Option<usize> {
         match self {
             Self::Rows(rows) => Some(rows),
@@ -91,7 +91,7 @@ pub struct AbsolutePath(pub PathBuf);
 pub enum InitChoice {
     /// One on each point of the dataset's reconstruction.
     Points,
-    /// Random places that the cameras see.
+    /// One at each of some random points that the cameras see.
     Random,
     /// The Gaussians of this file, in the dataset's coordinates.
     Model(AbsolutePath),

@@ -6,9 +6,9 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Cell {
-    /// Lower bounds, inclusive.
+    /// Lower bounds along both axes of the ground, inclusive `[world units]`.
     pub low: [f64; 2],
-    /// Upper bounds, exclusive.
+    /// Upper bounds along both axes of the ground, exclusive `[world units]`.
     pub high: [f64; 2],
 }
 
@@ -34,7 +34,7 @@ pub(super) fn divide(points: &[[f64; 2]], work: &[f64], [strips, across]: [usize
     strips.flat_map(|strip| cut(strip, 1, points, work, across)).collect()
 }
 
-/// Cuts a cell along an axis into parts of equal work.
+/// Cuts a cell along an axis into a number of parts of equal work.
 fn cut(cell: Cell, axis: usize, points: &[[f64; 2]], work: &[f64], parts: usize) -> Vec<Cell> {
     let mut order: Vec<usize> = (0..points.len()).filter(|&i| cell.contains(points[i])).collect();
     order.sort_by(|&a, &b| points[a][axis].total_cmp(&points[b][axis]));

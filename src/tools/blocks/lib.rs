@@ -39,7 +39,7 @@ pub use task::run;
 const MAX_PLAN: u64 = 256 << 20;
 /// File name of the plan.
 pub const PLAN_FILE: &str = "plan.toml";
-/// Run descriptions of the coarse run and of a block: the user's options and those that the plan sets.
+/// File names of the options of the coarse run and of a block's run: the user's and those that the plan sets.
 const COARSE_FILE: &str = "coarse.toml";
 const BLOCK_FILE: &str = "block.toml";
 /// Default file name of the merged model.
@@ -91,7 +91,7 @@ pub struct Block {
     pub name: String,
     /// Its share of the merged model's budget.
     pub rows: usize,
-    /// Budget in training, margin included; the merge drops the Gaussians in the margin.
+    /// Budget in training, margin included and frozen rows excluded; the merge drops the Gaussians in the margin.
     pub budget: usize,
     /// Number of training views that see its cell.
     pub views: usize,
@@ -151,8 +151,8 @@ impl BlockPlan {
         self.tasks().find(|task| self.name(*task) == name).ok_or_else(|| {
             let names: Vec<&str> = self.tasks().map(|task| self.name(task)).collect();
             let count = names.len();
-            let shown = if count <= 12 { names.join(", ") } else { format!("{count} of them") };
-            Failure::input(format!("this plan has no task `{name}`; its tasks: {shown}"))
+            let tasks = if count <= 12 { names.join(", ") } else { format!("{count} tasks") };
+            Failure::input(format!("this plan has no task `{name}`; it has {tasks}"))
         })
     }
 

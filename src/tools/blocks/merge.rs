@@ -66,15 +66,15 @@ pub fn merge(
     }
     // The header holds the number of rows, so each block is read twice.
     let mut rows = 0;
-    let (mut frame, mut stated) = (Frame::WORLD, None);
+    let (mut frame, mut first_antialiasing) = (Frame::WORLD, None);
     for &index in &complete {
         let part = read_part(folder, plan, index, observer)?;
         rows += part.len();
-        // Blocks in local coordinates have offsets of their own; the model gets the first.
+        // Blocks in local coordinates have offsets of their own; the merged model gets that of the first block.
         if frame.offset().is_none() {
             frame = Frame::from_origin(part.origin);
         }
-        let antialiasing = *stated.get_or_insert(part.antialiasing);
+        let antialiasing = *first_antialiasing.get_or_insert(part.antialiasing);
         if part.antialiasing != antialiasing {
             return Err(Failure::input(format!(
                 "{} was trained with antialiasing {}, but the blocks before it with {antialiasing}; train this block \
@@ -84,10 +84,10 @@ pub fn merge(
         }
     }
     if rows > plan.rows {
-        let message = format!("{rows} rows, but the plan allows only {}; this is a bug", plan.rows);
+        let message = format!("{rows} Gaussians, but the plan allows {}; this is a bug", plan.rows);
         return Err(Failure::new(OTHER, message));
     }
-    let antialiasing = stated.unwrap_or_default();
+    let antialiasing = first_antialiasing.unwrap_or_default();
     let shape = Shape { rows, sh_degree: plan.sh_degree, antialiasing, frame };
     let write = |out: &mut dyn Write| {
         let mut writer = format.open_writer(shape, out)?;

@@ -29,7 +29,7 @@ impl FromStr for Grid {
         };
         let (strips, across) = parts.ok_or_else(|| {
             format!(
-                "`{text}` is not a grid of blocks; give 4, 3x2 or auto, at most {MAX_GRID} a side"
+                "`{text}` is not a grid of blocks; give 4, 3x2 or auto, with at most {MAX_GRID} on a side"
             )
         })?;
         Ok(Self::Fixed([strips, across]))

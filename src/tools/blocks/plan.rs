@@ -71,7 +71,7 @@ pub fn plan(options: &PlanOptions, observer: &dyn Observer) -> Result<BlockPlan,
     Ok(blocks)
 }
 
-/// Creates a temporary folder beside the plan's.
+/// Creates a temporary folder beside the plan's folder.
 fn create_staging(output: &Path) -> Result<TempDir, Failure> {
     let is_empty = fs::read_dir(output).map(|mut entries| entries.next().is_none());
     match is_empty {
@@ -204,7 +204,7 @@ impl<'a> Planner<'a> {
                     Err(failure) if is_too_large(&failure) => last = Some(failure),
                     Err(failure) => {
                         return Err(last.unwrap_or(failure).and(&format!(
-                            "no division fits --memory {}: {}x{} blocks are too small already; give more memory, \
+                            "no division fits --memory {}: {}x{} blocks are already too small; give more memory, \
                              or fewer --rows",
                             Bytes(memory),
                             grid[0],
@@ -302,7 +302,7 @@ impl<'a> Planner<'a> {
         options.over(self.shared_options())
     }
 
-    /// The run with these options on the plan's scene.
+    /// Describes a run with these options on the plan's scene.
     fn spec_of(&self, options: Partial, budget: usize) -> Result<RunSpec, Failure> {
         let mut spec = options.describe()?;
         spec.start.scene = Some(self.scene.clone());
@@ -347,7 +347,7 @@ impl<'a> Planner<'a> {
         if rows < wanted {
             let memory = Bytes(self.options.memory.unwrap_or_default());
             return Err(Failure::input(format!(
-                "{TOO_LARGE} for --memory {memory}: {name} has {} Gaussians, of which {} fit; give more --blocks, \
+                "{TOO_LARGE} for --memory {memory}: {name} has {} Gaussians, but only {} fit; give more --blocks, \
                  more --memory, or fewer --rows",
                 grouped(wanted),
                 grouped(rows)
@@ -356,7 +356,7 @@ impl<'a> Planner<'a> {
         Ok(ledger.on_host())
     }
 
-    /// Writes all files but the lists of views, which exist already.
+    /// Writes all files except the lists of views, which already exist.
     fn write(&self, plan: &BlockPlan, staging: &Path) -> Result<(), Failure> {
         let text =
             |partial: Partial| toml::to_string(&partial.into_table()).map_err(Failure::input);
@@ -383,7 +383,7 @@ impl<'a> Planner<'a> {
     }
 }
 
-/// Start of the message of a failure that more blocks may avoid.
+/// Start of the message of a failure that a plan with more blocks may avoid.
 const TOO_LARGE: &str = "a task is too large";
 
 fn is_too_large(failure: &Failure) -> bool {

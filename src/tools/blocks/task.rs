@@ -20,9 +20,9 @@ use densify_run::finished::{iteration, read_model};
 use densify_run::{Host, Observer, Occupied, Partial, Run, start};
 use densify_train::output::model_path;
 
-/// Lists the views of a block.
+/// File that lists the views of a block.
 pub(super) const VIEWS_FILE: &str = "views.txt";
-/// The coarse Gaussians from which a block starts, and those that it renders as frozen.
+/// Files with the coarse Gaussians from which a block starts, and with those that it renders as frozen.
 const START_FILE: &str = "start.ply";
 const FROZEN_FILE: &str = "frozen.ply";
 /// Distance beyond an image's border at which a Gaussian may still contribute to it, as a fraction of the image's size.

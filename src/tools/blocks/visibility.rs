@@ -23,11 +23,11 @@ const MAX_TEST_POINTS: usize = 2_000;
 /// The points of a scene, their positions on the ground, and the training views that see each.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Visibility {
-    /// Scene coordinates. Shape: `[points]`.
+    /// Positions in scene coordinates. Shape: `[points]`.
     points: Vec<DVec3>,
-    /// Ground coordinates. Shape: `[points]`.
+    /// Positions in ground coordinates `[world units]`. Shape: `[points]`.
     pub(super) on_ground: Vec<[f64; 2]>,
-    /// Indices of training views. Shape: `[points][views]`.
+    /// Indices of the training views that see each point. Shape: `[points][views]`.
     seen_by: Vec<Vec<u32>>,
 }
 
@@ -77,14 +77,14 @@ impl Visibility {
         self.seen_by.iter().map(|views| views.len() as f64).collect()
     }
 
-    /// Robust size of the scene along both axes of the ground.
+    /// Size of the scene along both axes of the ground, robust to outliers `[world units]`.
     pub(super) fn widths(&self) -> [f64; 2] {
         [0, 1].map(|axis| {
             let centre = median(self.on_ground.iter().map(|at| at[axis]).collect());
             let deviation = |centre: f64| {
                 median(self.on_ground.iter().map(|at| (at[axis] - centre).abs()).collect())
             };
-            // A uniform distribution is four times as wide as its median deviation.
+            // A uniform distribution is four times as wide as its median absolute deviation.
             4.0 * centre.and_then(deviation).unwrap_or_default()
         })
     }
@@ -122,7 +122,7 @@ impl Visibility {
         train.chain(test).collect()
     }
 
-    /// The coverage of each training view by all points and by those that are inside. Shape: `[views]`.
+    /// The coverage of each training view by all points and by those inside a cell. Shape: `[views]`.
     fn coverage(&self, train: &[View], is_inside: impl Fn([f64; 2]) -> bool) -> Vec<Coverage> {
         let mut coverage = vec![Coverage::default(); train.len()];
         for ((point, at), views) in self.points.iter().zip(&self.on_ground).zip(&self.seen_by) {
@@ -162,11 +162,11 @@ impl Visibility {
 /// How many points a view sees, and where those inside a cell lie in its image.
 #[derive(Debug, Clone, Copy, Default)]
 struct Coverage {
-    /// Number of visible points that are inside.
+    /// Number of visible points inside the cell.
     inside: u32,
     /// Number of visible points.
     all: u32,
-    /// The part of the image with the points inside and a margin; `None` if there are none.
+    /// The part of the image that contains the points inside the cell, with a margin; `None` if there are none.
     part: Option<Part>,
 }
 

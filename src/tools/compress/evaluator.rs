@@ -37,10 +37,10 @@ impl Evaluator {
         Ok(Self { dataset, machine, near, background, fits_exposure })
     }
 
-    /// Measures the original model, which was read from `file`, and would be of this size as a PLY.
+    /// Measures the original model, which was read from `file`; `bytes` is its size as a PLY.
     ///
     /// # Errors
-    /// As [`evaluate`](Self::evaluate), and when the model is not in the coordinates of the dataset.
+    /// If rendering fails, or the model is not in the coordinates of the dataset.
     pub(super) fn evaluate_original(
         &self,
         model: Gaussians,
@@ -48,15 +48,15 @@ impl Evaluator {
         bytes: u64,
         observer: &dyn Observer,
     ) -> Result<Attempt, Failure> {
-        let rendering = (self.background, model.sh_degree);
+        let sh_degree = model.sh_degree;
         let views = views_of(&self.dataset, Split::Train)?;
         let mut backend = self.machine.backend(&self.dataset, model, self.near)?;
-        CoordinateCheck::measure(backend.as_mut(), &views, rendering)?
+        CoordinateCheck::measure(backend.as_mut(), &views, (self.background, sh_degree))?
             .require(None, file, observer)?;
-        self.measure(backend.as_mut(), rendering.1, PLY, bytes)
+        self.measure(backend.as_mut(), sh_degree, PLY, bytes)
     }
 
-    /// Measures a model whose file has this size.
+    /// Measures a model; `bytes` is the size of its file.
     pub(super) fn evaluate(
         &self,
         model: Gaussians,
@@ -85,7 +85,7 @@ impl Evaluator {
                 let rendering = backend.render(views.camera(view), self.background, sh_degree)?;
                 let score =
                     |rgb: &[f32]| psnr(rgb, &image, self.background).map_err(Failure::input);
-                // Also checks that the render and the photograph can be compared.
+                // This also checks that the render and the photograph can be compared, so it runs in either case.
                 let mut value = score(&rendering.rgb)?;
                 if self.fits_exposure {
                     value = score(&fitted(&rendering.rgb, &image, self.background))?;

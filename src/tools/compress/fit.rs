@@ -12,7 +12,7 @@ use densify_run::failure::{Failure, INPUT, OTHER};
 use densify_run::finished::write_in_frame;
 use densify_train::importance::{footprints, largest};
 
-/// Fraction of the size that an estimate aims at: training changes the compression ratio.
+/// Fraction of the size limit that an estimate aims at, because training changes the compression ratio.
 const FILL: f64 = 0.98;
 /// Maximum number of estimates of the number of rows.
 const MAX_ESTIMATES: usize = 8;
@@ -34,7 +34,7 @@ impl Write for ByteCounter {
     }
 }
 
-/// Size of a model's file in a format.
+/// Size of a model's file in a format `[bytes]`.
 pub(super) fn file_size(format: &Format, model: &Gaussians) -> Result<u64, Failure> {
     let mut counter = ByteCounter::default();
     format.write(model, &mut counter).map_err(|error| {
@@ -75,21 +75,21 @@ fn write_scratch(
     Ok(remove_sidecar(scratch)?)
 }
 
-/// Tries each format in the file `scratch`, and returns those that can hold the model. Tells the observer what they
-/// change, and which formats cannot hold it.
+/// Writes the model to the file `scratch` in each format, and returns the formats that can hold it. Tells the observer
+/// what they change, and which formats cannot hold the model.
 ///
 /// # Errors
 /// When no format can hold the model, or the disk fails.
-pub(super) fn fitting(
+pub(super) fn usable_formats(
     options: &Options<'_>,
     model: &Gaussians,
     scratch: &Path,
     observer: &dyn Observer,
 ) -> Result<Vec<&'static Format>, Failure> {
-    let (mut fitting, mut unfit) = (Vec::new(), None);
+    let (mut usable, mut unfit) = (Vec::new(), None);
     for &format in options.formats {
         match write_scratch(format, scratch, model, observer) {
-            Ok(()) => fitting.push(format),
+            Ok(()) => usable.push(format),
             Err(failure) if failure.code == INPUT && options.formats.len() > 1 => {
                 observer.say(format_args!("note: not tried: {failure}"));
                 unfit = unfit.or(Some(failure));
@@ -97,7 +97,7 @@ pub(super) fn fitting(
             Err(failure) => return Err(failure),
         }
     }
-    unfit.filter(|_| fitting.is_empty()).map_or(Ok(fitting), Err)
+    unfit.filter(|_| usable.is_empty()).map_or(Ok(usable), Err)
 }
 
 /// A format, and the number of rows of the untrained model with which its file meets the target.
@@ -105,7 +105,7 @@ pub(super) fn fitting(
 pub(super) struct Packing {
     pub(super) format: &'static Format,
     pub(super) rows: usize,
-    /// All rows fit, with at least the format's default accuracy.
+    /// True if all rows fit, with at least the format's default accuracy.
     pub(super) is_whole: bool,
 }
 
@@ -150,8 +150,8 @@ pub(super) fn packings(options: &Options<'_>, model: &Gaussians) -> Result<Vec<P
     Ok(packings)
 }
 
-/// Estimates with how many rows of this model the file meets the target; [`trim`] drops any that are too many. `None` if
-/// not even one row fits.
+/// Estimates with how many rows of this model the file meets the target; [`trim`] drops any that are too many. `None`
+/// if not even one row fits.
 pub(super) fn rows_that_fit(
     to: Target,
     format: &Format,
@@ -213,7 +213,7 @@ pub(super) fn trim(
     }
 }
 
-/// Size of the smallest file with one Gaussian, and its format.
+/// Size of the smallest file with one Gaussian `[bytes]`, and the name of its format.
 fn smallest_size(options: &Options<'_>, model: &Gaussians) -> (u64, &'static str) {
     let one = model.gather(&[0]).with_degree(0);
     let sizes = options.formats.iter();
@@ -225,6 +225,6 @@ fn smallest_size(options: &Options<'_>, model: &Gaussians) -> (u64, &'static str
 pub(super) fn too_small(options: &Options<'_>, model: &Gaussians) -> Failure {
     let (least, format) = smallest_size(options, model);
     Failure::input(format!(
-        "--to: no model fits; one Gaussian takes {least} bytes as {format}; give more"
+        "--to: no model fits; one Gaussian takes {least} bytes as {format}; give a larger size"
     ))
 }

@@ -83,26 +83,26 @@ pub struct Attempt {
     pub sh_degree: u8,
     /// Name of the file's format.
     pub format: &'static str,
-    /// Size of the file.
+    /// Size of the file `[bytes]`.
     pub bytes: u64,
     /// Mean PSNR of the training views `[dB]`, with the best-fitting exposure of each if exposures are learned.
     pub train_psnr: f64,
-    /// Mean PSNR of the test views, if there are any.
+    /// Mean PSNR of the test views `[dB]`, if there are any.
     pub test_psnr: Option<f64>,
 }
 
 /// The result of [`compress`].
 #[derive(Debug, Clone, PartialEq)]
 pub struct Compressed {
-    /// The original model as PLY.
+    /// Measurements of the original model, with the size that it has as a PLY.
     pub whole: Attempt,
     /// Measurements of the best attempt after each stage of its training but the last.
     pub stages: Vec<Attempt>,
     /// All attempts in order.
     pub attempts: Vec<Attempt>,
-    /// Index of the attempt in the file.
+    /// Index of the attempt whose model was written to the file.
     pub best: usize,
-    /// The file.
+    /// Path of the file.
     pub file: PathBuf,
 }
 
@@ -124,13 +124,13 @@ pub fn compress(options: &Options<'_>, observer: &dyn Observer) -> Result<Compre
     let whole = evaluator.evaluate_original(model.clone(), options.model, bytes, observer)?;
     let scratch = create_scratch_file(options.output)?;
     let allowed_formats = options.formats;
-    let formats = fit::fitting(options, &model, &scratch, observer)?;
+    let formats = fit::usable_formats(options, &model, &scratch, observer)?;
     let options = &Options { formats: &formats, ..options.clone() };
     let search = Search { options, observer, evaluator, scratch, model };
     let (mut attempts, mut best_stages) = (Vec::<Attempt>::new(), Vec::new());
     let mut best: Option<(usize, &Format, Gaussians)> = None;
     for degree in degrees(search.model.sh_degree, options.to) {
-        let packings = fit::packings(options, &search.start(degree))?;
+        let packings = fit::packings(options, &search.start_model(degree))?;
         for packing in &packings {
             let mut stages = Vec::new();
             let Some((attempt, small)) = search.attempt(packing, degree, &mut stages)? else {
@@ -173,7 +173,7 @@ struct Search<'a> {
 
 impl Search<'_> {
     /// The original model with at most this degree. Each attempt makes its own copy and drops it before it trains.
-    fn start(&self, degree: u8) -> Gaussians {
+    fn start_model(&self, degree: u8) -> Gaussians {
         colour::reduce(self.model.clone(), degree)
     }
 
@@ -192,7 +192,7 @@ impl Search<'_> {
     ) -> Result<Option<(Attempt, Gaussians)>, Failure> {
         let Self { options, observer, scratch, .. } = self;
         let Packing { format, rows, .. } = *packing;
-        let mut start = self.start(degree);
+        let mut start = self.start_model(degree);
         if !format.states_antialiasing(start.antialiasing) {
             // Readers of the file will assume this kernel.
             start.antialiasing = Antialiasing::Wide;
@@ -229,8 +229,8 @@ impl Search<'_> {
     ) -> Result<Attempt, Failure> {
         write_atomically(&self.scratch, |out| format.write(model, out))?;
         // The temporary file has no sidecar.
-        let found = Gaussians { origin: model.origin, ..read_model(&self.scratch, &Silent)? };
-        self.evaluator.evaluate(found, format, bytes)
+        let decoded = Gaussians { origin: model.origin, ..read_model(&self.scratch, &Silent)? };
+        self.evaluator.evaluate(decoded, format, bytes)
     }
 }
 

@@ -72,14 +72,14 @@ fn formats_that_do_not_hold_the_model_are_not_tried() {
     let mut model = colourful(400).with_degree(0);
     model.log_scales.fill([8.0; 3]);
     let spz = densify_data::models::find("spz").expect("a format");
-    let fitting = |formats: &[&'static Format]| {
+    let usable = |formats: &[&'static Format]| {
         let options = options(Target::Rows(9), Path::new(""), formats);
-        fit::fitting(&options, &model, &scratch, &Silent)
+        fit::usable_formats(&options, &model, &scratch, &Silent)
     };
     let names = |formats: Vec<&Format>| formats.iter().map(|format| format.name).collect();
-    let found: Vec<&str> = fitting(&[spz, sog(), PLY]).map(names).expect("two formats");
-    assert_eq!(found, ["sog", "ply"]);
-    let refused = fitting(&[spz]).expect_err("spz cannot hold it").to_string();
+    let usable_names: Vec<&str> = usable(&[spz, sog(), PLY]).map(names).expect("two formats");
+    assert_eq!(usable_names, ["sog", "ply"]);
+    let refused = usable(&[spz]).expect_err("spz cannot hold it").to_string();
     assert!(refused.contains("spz cannot hold") && refused.contains("such as"), "{refused}");
 }
 
@@ -92,7 +92,7 @@ fn only_variants_that_hold_enough_rows_are_tried() {
     let sizes: Vec<u64> = sog()
         .variants()
         .iter()
-        .map(|form| fit::file_size(form, &model).expect("it is written"))
+        .map(|variant| fit::file_size(variant, &model).expect("it is written"))
         .collect();
     assert!(sizes.len() > 2 && sizes.windows(2).all(|pair| pair[0] > pair[1]), "{sizes:?}");
     let formats = [sog()];
@@ -122,11 +122,11 @@ fn colours_stay_as_decoded_from_the_file() {
     let made = Made::colmap_txt();
     let formats = [sog()];
     let options = options(Target::Rows(256), made.path(), &formats);
-    let form = &sog().variants()[2];
+    let variant = &sog().variants()[2];
     let scratch = create_scratch_file(&made.path().join("small.sog")).expect("a file");
     let start = colourful(256);
     let tuned =
-        tune::tune(start.clone(), (form, 256), &options, &scratch, &Silent, &mut |_| Ok(()));
+        tune::tune(start.clone(), (variant, 256), &options, &scratch, &Silent, &mut |_| Ok(()));
     let tuned = tuned.expect("it trains");
     let palette = |model: &Gaussians| {
         let bands = model.sh.chunks_exact(3 * sh_coefficients(3)).map(|row| &row[3..]);

@@ -81,7 +81,7 @@ mod tests {
             (inline_svg(svg, (9, 9), evil))
         };
         let text = page(evil, &body);
-        assert_eq!(text.matches("<script>").count(), 1, "the page's own: {text}");
+        assert_eq!(text.matches("<script>").count(), 1, "only the page's own script: {text}");
         let escaped = "&lt;script&gt;alert(1)&lt;/script&gt;&quot;";
         assert_eq!(text.matches(escaped).count(), 3, "{text}");
         assert!(!text.contains("http:") && !text.contains("https:") && !text.contains("url("));

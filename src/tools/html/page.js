@@ -38,7 +38,7 @@ for (const pair of document.querySelectorAll(".pair")) {
   show();
 }
 
-// An orbit around the scene: one of many pictures.
+// An orbit around the scene: the slider selects one of its pictures.
 for (const turn of document.querySelectorAll(".turn")) {
   const slider = turn.querySelector("input");
   const pictures = [...turn.querySelectorAll("img")];

@@ -9,13 +9,13 @@ use image::{ExtendedColorType, RgbImage};
 
 use densify_core::files::{FileError, write_atomically};
 
-/// Longest side `[px]`.
+/// Maximum side of a WebP picture `[px]`.
 pub(crate) const MAX_SIDE: u32 = 16_383;
 /// Bytes before the chunks of a still picture: `RIFF`, a length, `WEBP`.
 const HEAD: usize = 12;
-/// The flag of animations in the extended header.
+/// Flag of the extended header that marks an animation.
 const ANIMATED: u8 = 2;
-/// The flag of frames that replace the previous one without blending.
+/// Flag of a frame that replaces the previous one without blending.
 const REPLACES: u8 = 2;
 
 /// An animation that is being written. Its frames are kept in a temporary file.
@@ -116,11 +116,11 @@ mod tests {
         let bytes = std::fs::read(&path).unwrap();
         assert_eq!(u32::from_le_bytes(bytes[4..8].try_into().unwrap()) as usize, bytes.len() - 8);
         let decoder = WebPDecoder::new(io::Cursor::new(bytes)).unwrap();
-        let found = decoder.into_frames().collect_frames().unwrap();
-        assert_eq!(found.len(), 3);
-        for (found, frame) in found.iter().zip(&frames) {
-            assert_eq!(found.delay().numer_denom_ms(), (40, 1));
-            let rgb = image::DynamicImage::from(found.buffer().clone()).into_rgb8();
+        let decoded = decoder.into_frames().collect_frames().unwrap();
+        assert_eq!(decoded.len(), 3);
+        for (decoded, frame) in decoded.iter().zip(&frames) {
+            assert_eq!(decoded.delay().numer_denom_ms(), (40, 1));
+            let rgb = image::DynamicImage::from(decoded.buffer().clone()).into_rgb8();
             assert!(rgb == *frame);
         }
     }

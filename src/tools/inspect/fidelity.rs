@@ -1,4 +1,4 @@
-//! Measures how closely a model in another format reproduces the original, in the views held out.
+//! Measures how closely a model in another format reproduces the original, in the held-out views.
 
 use std::path::Path;
 
@@ -50,7 +50,7 @@ impl Reference {
         Ok(Self { dataset, machine, near, background, sh_degree, backend })
     }
 
-    /// PSNR `[dB]` of another model's pictures against this one's, mean over the views held out.
+    /// PSNR `[dB]` of another model's pictures against this one's, averaged over the held-out views.
     ///
     /// # Errors
     /// When a view cannot be rendered.

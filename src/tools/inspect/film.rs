@@ -67,7 +67,7 @@ pub struct FilmSource {
     pub sh_degree: u8,
     /// Background colour, sRGB-encoded in `[0, 1]`.
     pub background: [f32; 3],
-    /// From the dataset's coordinates to the renderer's.
+    /// Transform from the dataset's coordinates to the renderer's.
     pub normalisation: Normalisation,
     /// The dataset's cameras, in the renderer's coordinates; empty if there is only a model.
     pub cameras: Vec<Camera>,
@@ -101,7 +101,7 @@ pub enum FilmError {
         width: u32,
         /// Height `[px]`.
         height: u32,
-        /// Memory that it takes `[bytes]`.
+        /// Memory that a frame takes `[bytes]`.
         bytes: u64,
     },
     /// The name of the video has an unknown extension.
@@ -112,14 +112,14 @@ pub enum FilmError {
     },
     /// MP4 needs ffmpeg.
     #[error(
-        "{path}: this needs the program ffmpeg, which was not found; install it, or name a .webp"
+        "{path}: this needs the program ffmpeg, which was not found; install it, or name a .webp file"
     )]
     NoFfmpeg {
         /// The video.
         path: PathBuf,
     },
     /// WebP has no frames of this size.
-    #[error("{path}: sides of WebP have at most {} px", animation::MAX_SIDE)]
+    #[error("{path}: a WebP has at most {} px on each side", animation::MAX_SIDE)]
     TooLargeForWebP {
         /// The video.
         path: PathBuf,
@@ -135,7 +135,7 @@ pub enum FilmError {
         problem: String,
     },
     /// The temporary file of the video could not be written.
-    #[error("{path}: a temporary file for the film: {source}")]
+    #[error("{path}: cannot write a temporary file for the film: {source}")]
     Temporary {
         /// The video.
         path: PathBuf,
@@ -206,10 +206,10 @@ impl Film {
     ) -> Result<Self, FilmError> {
         let FilmSource { mut backend, sh_degree, background, normalisation, cameras } = source;
         let first = cameras.first().map(|first| (first.width, first.height));
-        let own = |path| SavedCameraPath { path, frames: FRAMES, fps: None, size: None };
+        let generated = |path| SavedCameraPath { path, frames: FRAMES, fps: None, size: None };
         let (saved, in_world) = match route {
-            CameraRoute::Orbit => (own(camera_path::orbit(&cameras)), false),
-            CameraRoute::Spiral => (own(camera_path::spiral(&cameras)), false),
+            CameraRoute::Orbit => (generated(camera_path::orbit(&cameras)), false),
+            CameraRoute::Spiral => (generated(camera_path::spiral(&cameras)), false),
             CameraRoute::File(path) => (camera_path::read(path)?, true),
         };
         let frames = options.frames.unwrap_or(saved.frames);
@@ -265,9 +265,9 @@ fn encode(pictures: &Path, path: &Path, frames: u32, fps: u32) -> Result<(), Fil
         problem,
     };
     let film = tempfile::Builder::new().suffix(".mp4").tempfile();
-    let mut film = film.map_err(|e| failed(format!("a temporary file for the film: {e}")))?;
+    let mut film = film.map_err(|e| failed(format!("cannot create a temporary file: {e}")))?;
     let (rate, count) = (fps.to_string(), frames.to_string());
-    // Named relative to their folder: a % in its path would be part of the pattern.
+    // The pictures are named relative to their folder, because a % in its path would be part of the pattern.
     let input = ["-framerate", &rate, "-start_number", "0", "-i", "frame_%05d.png"];
     // The folder may also hold pictures of an earlier, longer film. yuv420p halves the resolution of colour each way,
     // so sides must be even.

@@ -153,7 +153,7 @@ impl LimitError {
         Self::Unknown { side, key: key.to_owned(), known, has_geometry }
     }
 
-    /// The message, with each side's option spelled as `spell` says.
+    /// The message, in which `spell` names the option of each side.
     pub fn message(&self, spell: impl Fn(Side) -> &'static str) -> String {
         match self {
             Self::Unknown { side, key, known, has_geometry } => {
@@ -165,7 +165,7 @@ impl LimitError {
                 let lpips =
                     if key == "lpips" { "; LPIPS is measured with --lpips FILE" } else { "" };
                 format!(
-                    "{}: nothing called `{key}` is measured; there are {}{geometry}{lpips}",
+                    "{}: no value called `{key}` is measured; those measured are {}{geometry}{lpips}",
                     spell(*side),
                     known.join(", ")
                 )
@@ -215,20 +215,20 @@ mod tests {
         let unknown = check("PSNR=1", "flip=1").unwrap_err();
         let is_unknown = matches!(unknown, LimitError::Unknown { .. });
         assert!(is_unknown && unknown.to_string().contains("psnr, ssim"), "{unknown}");
-        let early = |has_geometry, has_lpips, key: &str| {
+        let check_key = |has_geometry, has_lpips, key: &str| {
             Limits { lowest: &limit(&format!("{key}=1")), highest: &[] }
                 .check_keys(has_geometry, has_lpips)
         };
         for key in ["flip", "centres.f_score_one_percent", "thin.3.recall", "normal_error"] {
-            assert_eq!(early(true, false, key), Ok(()), "{key}");
-            let message = early(false, false, key).err().map(|error| error.to_string());
+            assert_eq!(check_key(true, false, key), Ok(()), "{key}");
+            let message = check_key(false, false, key).err().map(|error| error.to_string());
             let is_explained =
                 message.is_some_and(|text| text.contains("flip") && text.contains("scenegen"));
             assert_eq!(is_explained, key != "flip", "{key}");
         }
-        assert_eq!(early(false, true, "lpips"), Ok(()));
-        assert!(early(true, false, "lpips").unwrap_err().to_string().contains("--lpips"));
-        let typo = early(true, false, "depth.rsme").unwrap_err();
+        assert_eq!(check_key(false, true, "lpips"), Ok(()));
+        assert!(check_key(true, false, "lpips").unwrap_err().to_string().contains("--lpips"));
+        let typo = check_key(true, false, "depth.rsme").unwrap_err();
         assert!(typo.to_string().contains("depth.rmse"), "{typo}");
         for bad in ["psnr", "psnr=", "psnr=nan", "=x"] {
             assert!(bad.parse::<Limit>().is_err(), "{bad}");

@@ -26,7 +26,7 @@ pub struct Channels {
 pub struct PictureFolder {
     folder: PathBuf,
     channels: Channels,
-    /// Units of the dataset per scene unit.
+    /// Number of the dataset's units per scene unit.
     units: f64,
     /// The largest depth of each depth picture, in the dataset's units.
     largest_depth: BTreeMap<String, f64>,
@@ -79,7 +79,7 @@ impl PictureFolder {
         write_png(&path, &pair(image, background, rendering))
     }
 
-    /// Writes `depth.json`, which has the scales of the depth pictures, if there are any.
+    /// Writes the scales of the depth pictures to `depth.json`, if there are depth pictures.
     ///
     /// # Errors
     /// When the file cannot be written.

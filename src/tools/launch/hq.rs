@@ -7,7 +7,7 @@ use super::{Batch, EngineFile, run_scheduler};
 use densify_run::failure::Failure;
 
 const REMEDY: &str = "HyperQueue's `hq` must be on this machine's PATH, with a running server; otherwise choose --engine local or slurm";
-/// HyperQueue gives up a task whose worker was lost this many times.
+/// HyperQueue gives up on a task whose worker was lost this many times.
 const CRASH_LIMIT: u32 = 5;
 
 #[derive(Serialize)]

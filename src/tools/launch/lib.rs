@@ -42,7 +42,7 @@ pub struct Submission {
     pub with_memory: bool,
 }
 
-/// The options of commands that submit tasks, beside `--engine`.
+/// The options, besides `--engine`, of commands that submit tasks.
 #[derive(Debug, Clone, Default, Args)]
 pub struct SubmissionArgs {
     /// Print the files for the engine, and start nothing
@@ -83,7 +83,7 @@ impl SubmissionArgs {
         } else {
             return Ok(());
         };
-        Err(Failure::input(format!("{flag} is for --engine; give both, or none")))
+        Err(Failure::input(format!("{flag} needs --engine; give both, or neither")))
     }
 }
 
@@ -124,12 +124,12 @@ pub struct Job {
     pub memory: u64,
     /// Processor threads that it uses.
     pub threads: u32,
-    /// The task accepts a smaller number of threads through `--threads`.
+    /// True if the task accepts a smaller number of threads through `--threads`.
     pub may_have_fewer_threads: bool,
 }
 
 impl Batch {
-    /// Folder of the tasks' output.
+    /// Folder of the tasks' logs.
     fn logs(&self) -> PathBuf {
         self.folder.join("logs")
     }
@@ -142,7 +142,7 @@ impl Batch {
 
 /// A file for a scheduler.
 struct EngineFile {
-    /// Index of the stage that it starts, or starts with.
+    /// Index of the stage that the file starts; of the first, if it starts all stages.
     stage: usize,
     path: PathBuf,
     text: String,
@@ -161,8 +161,8 @@ const SUBMITTED_FILE: &str = "submitted.toml";
 /// IDs of the jobs submitted from a folder, as text; `None` if there were none.
 pub fn submitted_jobs(folder: &Path) -> Option<String> {
     let text = files::read_text(&folder.join(SUBMITTED_FILE), files::MAX_OPTIONS_BYTES).ok()?;
-    let before = toml::from_str::<Submitted>(&text).map(|record| record.jobs.join(", "));
-    Some(before.unwrap_or_else(|_| "unknown".to_owned()))
+    let jobs = toml::from_str::<Submitted>(&text).map(|record| record.jobs.join(", "));
+    Some(jobs.unwrap_or_else(|_| "unknown".to_owned()))
 }
 
 /// Runs the tasks on this machine and waits for them, or submits them to a scheduler.
@@ -193,8 +193,8 @@ pub fn submit(
     }
     if let Some(jobs) = submitted_jobs(&batch.folder).filter(|_| !submission.again) {
         return Err(Failure::input(format!(
-            "{} was already submitted, as job {jobs}; see {}, and when those jobs have ended \
-            submit incomplete tasks with --again",
+            "{} was already submitted, as job {jobs}; see {}; when those jobs have ended, submit \
+             incomplete tasks with --again",
             batch.folder.display(),
             batch.status
         )));

@@ -1,5 +1,5 @@
-//! Slurm: one job per stage, dependent on the success of the stage before; for a stage of many tasks an array job, or
-//! several if the cluster's arrays are too small.
+//! Slurm: one job per stage, which depends on the success of the previous stage. A stage of many tasks is an array job,
+//! or several array jobs if the cluster's arrays are too small.
 
 use std::fmt::Write as _;
 
@@ -27,7 +27,7 @@ pub(super) fn files(batch: &Batch) -> Result<Vec<EngineFile>, Failure> {
             let first = part[0].index / array_size * array_size;
             let name = match first / array_size {
                 0 => (*name).to_owned(),
-                others => format!("{name}-{}", others + 1),
+                index => format!("{name}-{}", index + 1),
             };
             files.push(script(batch, number, name, Some(first), part)?);
         }
@@ -86,7 +86,7 @@ fn script(
     Ok(EngineFile { stage, path: batch.folder.join("slurm").join(format!("{name}.sh")), text })
 }
 
-/// Submits the scripts, each dependent on those of the stage before, and adds the job IDs to `jobs`.
+/// Submits the scripts, each dependent on those of the previous stage, and adds the job IDs to `jobs`.
 pub(super) fn submit(files: &[EngineFile], jobs: &mut Vec<String>) -> Result<(), Failure> {
     let mut dependency = None;
     for stage in files.chunk_by(|a, b| a.stage == b.stage) {

@@ -25,14 +25,14 @@ pub(super) fn draw(runs: &[RunRecord]) -> Result<Option<Markup>, Failure> {
             thin(&points.collect::<Vec<_>>())
         }
     };
-    let tests = |run: &RunRecord| {
+    let test_psnr = |run: &RunRecord| {
         run.scores.iter().map(|(&step, mean)| (f64::from(step), mean.psnr)).collect()
     };
     let memory = records(|step| Some(step.resident_bytes? as f64 / MIB));
     let mut panels = vec![
         ("Loss", panel("loss", runs, records(|step| Some(f64::from(step.loss))))),
         ("Gaussians", panel("Gaussians", runs, records(|step| Some(step.rows as f64)))),
-        ("PSNR of the test views", panel("PSNR (dB)", runs, tests)),
+        ("PSNR of the test views", panel("PSNR (dB)", runs, test_psnr)),
     ];
     let mut memory = panel("resident memory (MiB)", runs, memory);
     memory.curves.extend(runs.iter().enumerate().filter_map(|(at, run)| {

@@ -17,7 +17,8 @@ const MAX_LINES: usize = 400;
 /// Totals over edits.
 #[derive(Default)]
 struct Totals {
-    /// Number of edits, and of Gaussians pruned, added, rewritten and denied, in the order of the table's columns.
+    /// Number of edits, of Gaussians pruned, added and rewritten, and of requests denied, in the order of the table's
+    /// columns.
     counts: [usize; 5],
     /// Iteration of the first edit.
     first: u32,
@@ -59,8 +60,8 @@ pub(super) fn tabulate(run: &RunRecord) -> Markup {
     let numbers = ["iteration", "before", "pruned", "added", "rewritten", "denied", "after"];
     let mut log =
         Table::new(numbers.map(Column::number).into_iter().chain([Column::text("cause")]));
-    let every = run.events.len().div_ceil(MAX_LINES).max(1);
-    let lines = run.events.iter().step_by(every);
+    let stride = run.events.len().div_ceil(MAX_LINES).max(1);
+    let lines = run.events.iter().step_by(stride);
     let count = lines.len();
     for event in lines {
         let EditEvent { step, before, removed, added, updated, denied, after, cause } = event;
@@ -73,7 +74,7 @@ pub(super) fn tabulate(run: &RunRecord) -> Markup {
         details {
             summary {
                 "The log: " (grouped(count))
-                @if every > 1 { " of " (grouped(run.events.len())) }
+                @if stride > 1 { " of " (grouped(run.events.len())) }
                 " edits"
             }
             (log.to_html())

@@ -51,33 +51,33 @@ pub(super) fn group(runs: &[RunRecord]) -> Result<Vec<Scene>, Failure> {
         let place = path.canonicalize().unwrap_or_else(|_| path.clone());
         let data = DataSpec { no_cache: false, ..run.config.spec.data.clone() };
         let settings = settings(run)?;
-        let found = scenes
+        let index = scenes
             .iter()
             .position(|(scene, other, _)| *other == place && scene.data == data)
             .unwrap_or_else(|| {
                 let label = scene_name(&path);
-                let again = scenes.iter().filter(|(_, other, _)| *other == place).count();
+                let earlier = scenes.iter().filter(|(_, other, _)| *other == place).count();
                 let is_taken = scenes.iter().any(|(scene, ..)| scene.label == label);
-                let label = match again {
+                let label = match earlier {
                     0 if is_taken => files::one_line(&path.display().to_string()),
                     0 => label,
-                    others => format!("{label}, other reading options ({})", others + 1),
+                    others => format!("{label}, read with other options ({})", others + 1),
                 };
                 let scene = Scene { label, path, data, groups: Vec::new() };
                 scenes.push((scene, place, Vec::new()));
                 scenes.len() - 1
             });
-        let (scene, _, known) = &mut scenes[found];
-        match known.iter().position(|other| *other == settings) {
+        let (scene, _, group_settings) = &mut scenes[index];
+        match group_settings.iter().position(|other| *other == settings) {
             Some(at) => scene.groups[at].runs.push(number),
             None => {
-                known.push(settings);
+                group_settings.push(settings);
                 scene.groups.push(Group { label: String::new(), runs: vec![number] });
             }
         }
     }
-    let finish = |(mut scene, _, known): (Scene, PathBuf, Vec<Table>)| {
-        for (group, label) in scene.groups.iter_mut().zip(labels(&known)) {
+    let finish = |(mut scene, _, group_settings): (Scene, PathBuf, Vec<Table>)| {
+        for (group, label) in scene.groups.iter_mut().zip(labels(&group_settings)) {
             group.runs.sort_by_key(|&run| runs[run].config.spec.schedule.seed);
             group.label = label;
         }
@@ -89,11 +89,11 @@ pub(super) fn group(runs: &[RunRecord]) -> Result<Vec<Scene>, Failure> {
 /// The settings that determine the result of a run, except scene and seed.
 fn settings(run: &RunRecord) -> Result<Table, Failure> {
     let mut all = Partial::all(&run.config.spec)?.into_table();
-    let decides = |name: &str| {
+    let determines_result = |name: &str| {
         name != "seed"
             && RunOption::find(name).is_some_and(|option| option.on_resume != OnResume::Free)
     };
-    all.retain(|name, _| decides(name));
+    all.retain(|name, _| determines_result(name));
     all.insert("densify".into(), run.config.densify.clone().into());
     all.insert("model of iteration".into(), run.iteration.into());
     let adapter = run.config.resolved.adapter.as_deref().unwrap_or("processor");
@@ -102,9 +102,9 @@ fn settings(run: &RunRecord) -> Result<Table, Failure> {
 }
 
 /// Labels for groups: the policy, and those options that all groups have and that differ between them.
-fn labels(known: &[Table]) -> Vec<String> {
+fn labels(group_settings: &[Table]) -> Vec<String> {
     const MAX_OPTIONS: usize = 3;
-    let all: Vec<_> = known.iter().map(flatten).collect();
+    let all: Vec<_> = group_settings.iter().map(flatten).collect();
     let Some((first, others)) = all.split_first() else { return Vec::new() };
     let differs = |name: &&String| {
         name.as_str() != "policy"
@@ -114,9 +114,9 @@ fn labels(known: &[Table]) -> Vec<String> {
     let differing: Vec<&String> = first.keys().filter(differs).collect();
     let label = |(number, options): (usize, &BTreeMap<String, String>)| {
         let policy = options.get("policy").cloned().unwrap_or_default();
-        let some = differing.iter().take(MAX_OPTIONS);
-        let some = some.map(|name| format!(", {name} {}", options[*name])).collect::<String>();
-        let mut label = format!("{policy}{some}");
+        let shown = differing.iter().take(MAX_OPTIONS);
+        let shown = shown.map(|name| format!(", {name} {}", options[*name])).collect::<String>();
+        let mut label = format!("{policy}{shown}");
         if differing.len() > MAX_OPTIONS {
             label += &format!(" … ({})", number + 1);
         }

@@ -37,13 +37,13 @@ pub(super) fn describe(run: &RunRecord) -> Option<Markup> {
         p {
             @match summary.peak_bytes {
                 Some(peak) => {
-                    "The process took " strong { (Bytes(peak)) } " at its peak; " (Bytes(promise)) " were promised"
+                    "The process took " strong { (Bytes(peak)) } " at its peak; it promised to take at most " (Bytes(promise))
                     @if peak <= promise { ", and the promise was kept." }
                     @else { ". " strong { "The promise was exceeded." } }
                 }
                 None => { "The process promised to take at most " (Bytes(promise)) "; this system does not report its peak." }
             }
-            @if device > 0 { " Of the device's memory it promised to take " (Bytes(device)) "." }
+            @if device > 0 { " It promised to take at most " (Bytes(device)) " of the device's memory." }
             @if let Some(limit) = summary.memory { " The limit was " (Bytes(limit)) "." }
         }
         details {

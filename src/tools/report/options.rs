@@ -13,24 +13,24 @@ use densify_run::{Partial, RunSpec};
 
 /// Maximum number of rows of the table of differences; more would not be readable.
 const MAX_DIFFERENCES: usize = 60;
-/// Options that are paths on the machine that trained; only their last component is published.
+/// Options that are paths on the machine that trained the run; only their last component is published.
 const PATHS: [&str; 6] = ["scene", "images", "sparse", "views", "init", "freeze"];
 
 /// All options with their full names, such as `knob.alpha_min`, and their values as text.
 pub(super) fn flatten(options: &Table) -> BTreeMap<String, String> {
-    fn walk(parent: &str, options: &Table, found: &mut BTreeMap<String, String>) {
+    fn walk(parent: &str, options: &Table, flat: &mut BTreeMap<String, String>) {
         for (name, value) in options {
             let name = if parent.is_empty() { name.clone() } else { format!("{parent}.{name}") };
             match value {
-                Value::Table(inner) => walk(&name, inner, found),
-                Value::String(text) => _ = found.insert(name, text.clone()),
-                value => _ = found.insert(name, value.to_string()),
+                Value::Table(inner) => walk(&name, inner, flat),
+                Value::String(text) => _ = flat.insert(name, text.clone()),
+                value => _ = flat.insert(name, value.to_string()),
             }
         }
     }
-    let mut found = BTreeMap::new();
-    walk("", options, &mut found);
-    found
+    let mut flat = BTreeMap::new();
+    walk("", options, &mut flat);
+    flat
 }
 
 /// The options of a run without private paths.
@@ -116,12 +116,12 @@ mod tests {
                 .iter()
                 .any(|known| names.iter().any(|name| name.contains(known)))
         });
-        let found: Vec<&str> = paths.map(|arg| arg.get_id().as_str()).collect();
-        assert!(found.len() > PATHS.len(), "{found:?}");
+        let paths: Vec<&str> = paths.map(|arg| arg.get_id().as_str()).collect();
+        assert!(paths.len() > PATHS.len(), "{paths:?}");
         // `exposure_model` is an enumeration, and the output folder is not published at all.
         let others = ["exposure_model", "output"];
         let unknown: Vec<_> =
-            found.iter().filter(|name| !PATHS.contains(name) && !others.contains(name)).collect();
+            paths.iter().filter(|name| !PATHS.contains(name) && !others.contains(name)).collect();
         assert!(unknown.is_empty(), "{unknown:?} may hold a path of this machine");
     }
 

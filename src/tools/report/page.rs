@@ -96,8 +96,8 @@ fn views(pictures: &ScenePictures) -> Markup {
     html! {
         p {
             @match pictures.split {
-                Split::Test => { "The worst and the best of " (count) " views held out, by PSNR" }
-                Split::Train => { "No view was held out: the worst and the best of " (count) " views trained on, by PSNR" }
+                Split::Test => { "The worst and the best of " (count) " held-out views, by PSNR" }
+                Split::Train => { "No view was held out: the worst and the best of " (count) " training views, by PSNR" }
             }
             @if runs > 1 { " with " (pictures.ranked_by) }
             ". Drag the border: the photograph is on its left, the render on its right."
@@ -196,7 +196,7 @@ fn details(run: &RunRecord) -> Result<Markup, Failure> {
         @if let Some(reductions) = &run.reductions {
             h3 { "Automatic reductions" }
             @if reductions.left_out.is_empty() {
-                p { "Nothing" @if reductions.full { ", as requested (--full)" } "." }
+                p { "None" @if reductions.full { ", as requested (--full)" } "." }
             } @else {
                 ul { @for left in &reductions.left_out {
                     li { strong { (left.what) } ": " (left.evidence) "; " (left.loss) "." }

@@ -51,7 +51,7 @@ pub(super) struct ViewComparison {
     pub(super) pictures: Vec<NamedPicture>,
     /// The same crop of each picture.
     pub(super) crops: Vec<NamedPicture>,
-    /// Run, PSNR `[dB]`, SSIM and FLIP.
+    /// Name of each run, with PSNR `[dB]`, SSIM and FLIP of its render.
     pub(super) scores: Vec<(String, [f64; 3])>,
 }
 
@@ -96,8 +96,8 @@ pub(super) fn render(
         observer.say(format_args!("pictures {}", run.name));
         let model = read_model(&model_path(&run.folder, run.iteration), observer)?;
         let degree = model.sh_degree;
-        let own = run.config.spec.start.near;
-        let near = own
+        let given = run.config.spec.start.near;
+        let near = given
             .map_or_else(|| NearPlane::choose(None, &dataset).distance(), NearPlane::distance_of);
         let backend = machine.backend(&dataset, model, near)?;
         let mut renderer = Renderer { backend, background, degree };
@@ -191,7 +191,7 @@ fn rank_views(
             evaluated.collect::<Result<_, Failure>>()?
         }
     };
-    // Ties are in dataset order.
+    // Views of equal PSNR stay in the order of the dataset.
     ranked.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
     Ok(ranked.into_iter().map(|(_, view)| view).collect())
 }
@@ -225,7 +225,7 @@ fn crop(name: &str, image: &RgbImage, window: Window) -> Result<NamedPicture, Fa
     })
 }
 
-/// Shrinks a size to fit a square of this side, keeping the aspect ratio.
+/// Shrinks a size to fit into a square of this side, keeping the aspect ratio.
 fn limit_size((width, height): (u32, u32), side: u32) -> (u32, u32) {
     let scale = (f64::from(side) / f64::from(width.max(height))).min(1.0);
     let scaled = |side: u32| ((f64::from(side) * scale).round() as u32).max(1);

@@ -32,7 +32,7 @@ pub(super) struct RunRecord {
     pub(super) reductions: Option<Reductions>,
     /// Mean scores of the test views by iteration.
     pub(super) scores: BTreeMap<u32, Mean>,
-    /// PSNR of each test view for this model, by name `[dB]`.
+    /// PSNR of the model in the report for each test view, by the view's name `[dB]`.
     pub(super) by_view: BTreeMap<String, f64>,
     pub(super) geometry: Option<Geometry>,
 }

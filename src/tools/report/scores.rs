@@ -148,11 +148,11 @@ fn tabulate_scene(scene: &Scene, runs: &[RunRecord]) -> Markup {
         let mut row = vec![group.label.clone(), group.runs.len().to_string()];
         for (_, value, digits) in SCORES {
             let values = values_by_seed(group, runs, |run| run.score().map(|mean| value(&mean)));
-            row.push(mean_of(&values, digits));
+            row.push(format_mean(&values, digits));
         }
         if scene.groups.len() > 1 {
             let is_first = std::ptr::eq(group, first);
-            row.push(if is_first { DASH.to_owned() } else { against_first(group, first, runs) });
+            row.push(if is_first { DASH.to_owned() } else { psnr_difference(group, first, runs) });
         }
         row
     };
@@ -174,14 +174,14 @@ fn values_by_seed(
     group.runs.iter().filter_map(pair).collect()
 }
 
-/// `30.12 [29.95, 30.29]`
-fn mean_of(values: &[Pair<'_>], digits: usize) -> String {
-    let Some(found) = Difference::new(values) else { return DASH.to_owned() };
-    let within = found.format_interval(|[low, high]| format!("{low:.digits$}, {high:.digits$}"));
-    format!("{:.digits$}{within}", found.mean)
+/// Formats the mean with its interval, as `30.12 [29.95, 30.29]`.
+fn format_mean(values: &[Pair<'_>], digits: usize) -> String {
+    let Some(value) = Difference::new(values) else { return DASH.to_owned() };
+    let interval = value.format_interval(|[low, high]| format!("{low:.digits$}, {high:.digits$}"));
+    format!("{:.digits$}{interval}", value.mean)
 }
 
-fn against_first(group: &Group, first: &Group, runs: &[RunRecord]) -> String {
+fn psnr_difference(group: &Group, first: &Group, runs: &[RunRecord]) -> String {
     let psnr = |run: &RunRecord| run.score().map(|mean| mean.psnr);
     let base = values_by_seed(first, runs, psnr);
     let pair = |pair: Pair<'static>| {
@@ -190,7 +190,7 @@ fn against_first(group: &Group, first: &Group, runs: &[RunRecord]) -> String {
     };
     let differences: Vec<Pair<'_>> =
         values_by_seed(group, runs, psnr).into_iter().filter_map(pair).collect();
-    Difference::new(&differences).map_or_else(|| DASH.to_owned(), |found| found.format(2))
+    Difference::new(&differences).map_or_else(|| DASH.to_owned(), |difference| difference.format(2))
 }
 
 /// Tabulates geometric errors against the known surface; `None` if it is not known.

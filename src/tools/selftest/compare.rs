@@ -262,8 +262,8 @@ mod tests {
         refused(&one(50, 0.006), cpu, "at a boundary");
         refused(&corrupted((0..110).step_by(10), alternating), cpu, "11 of 10000");
         refused(&corrupted((0..1000).step_by(10), |_| 0.004), lenient, "bias 1.00");
-        let mostly = |k: usize| if k.is_multiple_of(5) { 0.004 } else { -0.004 };
-        refused(&corrupted((0..1000).step_by(10), mostly), lenient, "bias -0.60");
+        let mostly_negative = |k: usize| if k.is_multiple_of(5) { 0.004 } else { -0.004 };
+        refused(&corrupted((0..1000).step_by(10), mostly_negative), lenient, "bias -0.60");
         assert!(outcome(&[0.0; 5], cpu).is_err(), "lengths that disagree");
         for measured in [[0.0, f32::NAN, 0.5], [f32::NAN, 0.0, 0.0]] {
             // The NaN is not hidden by the next channel.

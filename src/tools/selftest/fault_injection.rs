@@ -37,7 +37,7 @@ enum Fault {
     Steps,
     /// A downloaded model with wrong values.
     Model,
-    /// One row too many in the audit.
+    /// One non-finite number too many reported by the audit.
     Audit,
 }
 
@@ -277,7 +277,7 @@ fn every_figure_can_fail() {
     let faults = [Images, Gradients, NotANumber, Steps, Model, Audit];
     let mut failed: BTreeSet<_> =
         faults.into_iter().flat_map(|fault| finding_kinds(Some(fault), false)).collect();
-    // No fault makes this figure fail: the trainer stops a backend that exceeds its budget before it is counted.
+    // No fault makes this figure fail: the trainer stops a backend that exceeds its budget before the step is counted.
     failed.insert((30, "steps over the budget".into()));
     let never: Vec<_> = all.difference(&failed).collect();
     assert!(never.is_empty(), "these never fail: {never:?}");

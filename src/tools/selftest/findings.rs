@@ -74,27 +74,27 @@ const NOT_FINITE: &str = "NaN or infinity";
 
 /// The worst finding of each kind, in the order in which kinds first appear; then the failures without a figure.
 pub(super) fn worst(case: u8, table: &Table) -> Vec<Finding> {
-    let mut found: Vec<Finding> = Vec::new();
+    let mut findings: Vec<Finding> = Vec::new();
     for (place, quantity, error, tolerance) in table.rows() {
         let kind = kind(quantity);
         let place =
             if kind == quantity { place.to_owned() } else { format!("{place}: {quantity}") };
         let finding = Finding { case, kind: kind.into(), place, error, tolerance };
-        match found.iter_mut().find(|other| other.kind == finding.kind) {
+        match findings.iter_mut().find(|other| other.kind == finding.kind) {
             Some(other) if finding.relative() > other.relative() => *other = finding,
             Some(_) => {}
-            None => found.push(finding),
+            None => findings.push(finding),
         }
     }
     let failed = |place: &str| {
         let (kind, place) = ("failed".into(), place.into());
         Finding { case, kind, place, error: f64::NAN, tolerance: 0.0 }
     };
-    found.extend(table.messages().map(failed));
-    if found.is_empty() {
-        found.push(failed("nothing was compared"));
+    findings.extend(table.messages().map(failed));
+    if findings.is_empty() {
+        findings.push(failed("nothing was compared"));
     }
-    found
+    findings
 }
 
 #[cfg(test)]
@@ -112,8 +112,8 @@ mod tests {
         table.check("c", "loss", f64::NAN, 1.0);
         table.check("d", "loss", 0.5, 1.0);
         table.fail("it broke".into());
-        let found = worst(3, &table);
-        let shown: Vec<_> = found.iter().map(|f| (&*f.kind, &*f.place, f.passes())).collect();
+        let findings = worst(3, &table);
+        let shown: Vec<_> = findings.iter().map(|f| (&*f.kind, &*f.place, f.passes())).collect();
         let expected = [
             ("image", "b: depth", true),
             ("steps", "b", false),

@@ -69,9 +69,9 @@ mod tests {
     fn panics_and_errors_are_failures() {
         let subject = Subject::NATIVE;
         for (run, findings) in [(panics as fn(&mut Trial<'_>) -> _, 1), (fails, 2)] {
-            let found = Case { number: 1, title: "x", run }.run(&subject, false);
-            assert_eq!(found.len(), findings);
-            assert!(!found.last().unwrap().passes(), "{found:?}");
+            let reported = Case { number: 1, title: "x", run }.run(&subject, false);
+            assert_eq!(reported.len(), findings);
+            assert!(!reported.last().unwrap().passes(), "{reported:?}");
         }
     }
 }

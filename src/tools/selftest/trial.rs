@@ -23,7 +23,7 @@ const BROKEN_BY_STEPS: &str = "NaN or infinity in 5 steps and an edit";
 /// A running case.
 pub(super) struct Trial<'a> {
     pub(super) subject: &'a Subject,
-    /// Include checks that take minutes.
+    /// True to include checks that take minutes.
     pub(super) long: bool,
     pub(super) table: Table,
     /// Tolerances of images.
@@ -116,7 +116,7 @@ impl<'a> Trial<'a> {
         let (image, gradient) = backend.differentiate(camera, background, sh_degree, &upstream)?;
         let images: [&[f32]; 3] = [&image.rgb, &image.alpha, &image.depth];
         let gradients = CLASSES.map(|name| class(&gradient, name));
-        let broken = count_broken(&images) + count_broken(&gradients);
+        let broken = count_non_finite(&images) + count_non_finite(&gradients);
         self.count(label, "NaN or infinity", broken);
         self.train(label, &mut *backend, camera, background, sh_degree)?;
         Ok(gradient)
@@ -155,11 +155,11 @@ impl<'a> Trial<'a> {
         let close = boundary.iter().filter(|b| **b).count() as f64;
         let mut invisible = 0;
         for (row, expected) in rows.iter().enumerate() {
-            let off = f64::from(measured.pixel_count[row].abs_diff(expected.pixels));
-            self.record(label, "pixel_count", off, close);
-            let off = f64::from(measured.sum_weight[row]) - expected.sum_weight;
+            let error = f64::from(measured.pixel_count[row].abs_diff(expected.pixels));
+            self.record(label, "pixel_count", error, close);
+            let error = (f64::from(measured.sum_weight[row]) - expected.sum_weight).abs();
             let flips = close * Limits::CPU.step;
-            self.record(label, "sum_weight", off.abs(), tolerance * expected.sum_weight + flips);
+            self.record(label, "sum_weight", error, tolerance * expected.sum_weight + flips);
             invisible += usize::from(expected.pixels > 0 && !measured.visible[row]);
         }
         self.count(label, "rows blended but not visible", invisible);
@@ -192,7 +192,7 @@ impl<'a> Trial<'a> {
         broken += usize::from(backend.rows() != rows);
         broken += backend.audit()?.len();
         let image = backend.render(camera, background, sh_degree)?;
-        broken += count_broken(&[&image.rgb, &image.alpha, &image.depth]);
+        broken += count_non_finite(&[&image.rgb, &image.alpha, &image.depth]);
         self.count(label, BROKEN_BY_STEPS, broken);
         Ok(())
     }
@@ -224,7 +224,7 @@ pub(super) fn step(
 }
 
 /// Number of values that are not finite.
-pub(super) fn count_broken(arrays: &[&[f32]]) -> usize {
+pub(super) fn count_non_finite(arrays: &[&[f32]]) -> usize {
     arrays.iter().flat_map(|values| values.iter()).filter(|v| !v.is_finite()).count()
 }
 

@@ -6,7 +6,7 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use statrs::distribution::{ContinuousCDF, StudentsT};
 
-/// Resamples of a bootstrap, enough for a standard error accurate to one percent.
+/// Number of resamples of a bootstrap, enough for a standard error accurate to one percent.
 const RESAMPLES: usize = 10_000;
 /// Minimum number of runs, or of scenes, for which an interval is computed.
 const MIN_VALUES: usize = 3;
@@ -69,7 +69,7 @@ impl Difference {
             [seeds] => half_interval_over_seeds(seeds),
             scenes => half_interval_over_scenes(scenes),
         };
-        let count = |is: fn(f64) -> bool| pairs.iter().filter(|pair| is(pair.difference)).count();
+        let count = |has: fn(f64) -> bool| pairs.iter().filter(|pair| has(pair.difference)).count();
         Some(Self {
             mean,
             interval: half.map(|half| [mean - half, mean + half]),
@@ -173,12 +173,12 @@ mod tests {
 
     #[test]
     fn too_few_runs_or_scenes_give_a_reason_instead_of_an_interval() {
-        for (scenes, said) in [
+        for (scenes, expected) in [
             (&[&[0.5][..]][..], "+0.50, one run"),
             (&[&[0.0, 1.0]], "+0.50, two runs"),
             (&[&[0.0; 9], &[1.0; 9]], "+0.50, two scenes"),
         ] {
-            assert_eq!(difference(scenes).unwrap().format(2), said);
+            assert_eq!(difference(scenes).unwrap().format(2), expected);
         }
         assert!(difference(&[]).is_none());
         // Several budgets of one seed are not independent.
@@ -223,7 +223,7 @@ mod tests {
                 low <= 0.0 && 0.0 <= high
             };
             let count = (0..200).filter(holds).count();
-            // At least 190 are expected; the first percentile is 182.
+            // The expected count is at least 190; the first percentile of the count is 182.
             assert!(count >= 182, "{count} of 200 where scenes differ by {scene_deviation}");
         }
     }

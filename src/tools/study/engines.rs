@@ -19,14 +19,14 @@ pub struct EngineArgs {
     #[arg(long, value_name = "ENGINE")]
     engine: Option<Engine>,
     #[command(flatten)]
-    more: SubmissionArgs,
+    options: SubmissionArgs,
 }
 
 impl EngineArgs {
     pub(super) fn submission(&self) -> Result<Option<Submission>, Failure> {
         match self.engine {
-            Some(engine) => self.more.for_engine(engine).map(Some),
-            None => self.more.require_none().map(|()| None),
+            Some(engine) => self.options.for_engine(engine).map(Some),
+            None => self.options.require_none().map(|()| None),
         }
     }
 }

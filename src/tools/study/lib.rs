@@ -140,8 +140,8 @@ fn standard_error(values: &[f64]) -> Option<f64> {
 
 /// The options that all runs of a study share: those of the user, with test views held out and without checkpoints. An
 /// interrupted run starts over, so that its times are complete.
-fn shared_options(given: Partial, own: &[&str]) -> Result<Partial, Failure> {
-    if let Some((name, _)) = given.iter().find(|(name, _)| own.contains(name)) {
+fn shared_options(given: Partial, set_by_study: &[&str]) -> Result<Partial, Failure> {
+    if let Some((name, _)) = given.iter().find(|(name, _)| set_by_study.contains(name)) {
         return Err(Failure::input(format!(
             "--{} is set by the study itself; leave it out after `--`",
             name.replace('_', "-")

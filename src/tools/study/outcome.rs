@@ -36,9 +36,9 @@ pub(super) struct Outcome {
     pub(super) rows: usize,
     /// Largest number of Gaussians at any instant.
     pub(super) peak_rows: usize,
-    /// Peak resident memory of the process, if known.
+    /// Peak resident memory of the process `[bytes]`, if known.
     pub(super) peak_bytes: Option<u64>,
-    /// Memory promised by the ledger.
+    /// Memory promised by the ledger `[bytes]`.
     pub(super) ledger_bytes: u64,
     /// Wall time of training `[s]`.
     pub(super) seconds: f64,
@@ -46,7 +46,7 @@ pub(super) struct Outcome {
     pub(super) cpu_seconds: Option<f64>,
     /// Number of views rendered for the policy's decisions.
     pub(super) extra_forwards: u64,
-    /// Iterations and PSNR of the test views during training.
+    /// Iterations at which the test views were evaluated during training, with their mean PSNR `[dB]`.
     pub(super) curve: Vec<(u32, f64)>,
     /// Geometric errors, if the surface is known.
     #[serde(default, skip_serializing_if = "Option::is_none")]

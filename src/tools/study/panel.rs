@@ -36,7 +36,7 @@ pub struct Curve {
     pub points: Vec<(f64, f64)>,
     /// Index of the colour in the palette.
     pub colour: usize,
-    /// Drawn dashed.
+    /// True if the curve is drawn dashed.
     pub is_dashed: bool,
 }
 

@@ -54,7 +54,7 @@ impl PlannedRun {
         seed: u32,
         iterations: u32,
     ) -> Self {
-        let own = [
+        let options = [
             ("scene", Value::from(scene.to_string_lossy().into_owned())),
             ("budget", Value::from(i64::try_from(budget).unwrap_or(i64::MAX))),
             ("seed", Value::from(seed)),
@@ -67,7 +67,7 @@ impl PlannedRun {
             budget,
             seed,
             iterations,
-            spec: own.into_iter().fold(shared.clone(), add),
+            spec: options.into_iter().fold(shared.clone(), add),
             ..Self::default()
         }
     }
@@ -144,7 +144,7 @@ impl PlannedRun {
         };
         let Some(scores) = scores else {
             let scene = self.scene.display();
-            return Err(Failure::input(format!("{scene}: no view is held out to be scored")));
+            return Err(Failure::input(format!("{scene}: no view is held out for scoring")));
         };
         let path = model_path(folder, iterations);
         let model =

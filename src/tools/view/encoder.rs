@@ -184,7 +184,7 @@ fn resized_photograph(
     if (image.width, image.height) == (camera.width, camera.height) {
         return Ok((*image).clone());
     }
-    // Flattened first, so that transparent parts are blended as at full size.
+    // The photograph is flattened first, so that transparent parts are blended as at full size.
     let flat = photograph(&image, scene.background);
     let filter = imageops::FilterType::Triangle;
     let small = imageops::resize(&flat, camera.width, camera.height, filter);

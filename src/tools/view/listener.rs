@@ -21,7 +21,7 @@ pub struct ListenAddress {
     pub host: IpAddr,
     /// The port; by default the first free one from [`FIRST_PORT`] on.
     pub port: Option<u16>,
-    /// Puts a random token into the address of a loopback listener too: for a page that can control a run.
+    /// True to put a random token even into a loopback address, for a page that can control a run.
     pub needs_token: bool,
 }
 
@@ -30,7 +30,7 @@ pub struct ListenAddress {
 pub struct Server {
     pub(super) socket: TcpListener,
     address: SocketAddr,
-    /// True if other machines can reach it.
+    /// True if other machines can reach the page.
     is_public: bool,
     /// The first component of every path, if one is required.
     token: Option<String>,
@@ -64,7 +64,7 @@ impl Server {
             Some(port) => bind(port).map_err(|error| refused(port, error))?,
             None => {
                 let free = (FIRST_PORT..FIRST_PORT + PORTS).find_map(|port| bind(port).ok());
-                // With port 0 the system chooses.
+                // With port 0 the system chooses a free port.
                 free.map_or_else(|| bind(0), Ok).map_err(|error| refused(0, error))?
             }
         };

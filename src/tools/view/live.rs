@@ -63,11 +63,12 @@ fn page_bytes(
     // JPEG at the highest quality used here takes under 3 bytes per pixel, even for noise.
     let picture = pixels * 3;
     let float = size_of::<f32>() as u64;
-    let pixel = 5 * float + size_of::<f64>() as u64 + 4 * 3;
-    let whole = u64::from(largest_image.0) * u64::from(largest_image.1);
+    let bytes_per_pixel = 5 * float + size_of::<f64>() as u64 + 4 * 3;
+    let full_size_pixels = u64::from(largest_image.0) * u64::from(largest_image.1);
     // Resizing converts colours and alpha to floats.
-    let resizing = whole * (3 + 4 * float);
-    let encoding = pixels * pixel + resizing + photograph + scratch_bytes(largest_image.0, threads);
+    let resizing = full_size_pixels * (3 + 4 * float);
+    let encoding =
+        pixels * bytes_per_pixel + resizing + photograph + scratch_bytes(largest_image.0, threads);
     let connections = http::MAX_CONNECTIONS as u64 * CONNECTION_BYTES;
     let responses = MAX_WAITING as u64 * picture;
     let status = run_status::BYTES + POINTS_BYTES + views as u64 * VIEW_BYTES;
@@ -102,7 +103,7 @@ impl Server {
     /// Trains a run and serves its page until training ends.
     ///
     /// # Errors
-    /// Errors of training; a failing page does not stop it.
+    /// Errors of training; a failing page does not stop training.
     pub fn follow<T>(
         &self,
         mut run: Run,
@@ -124,11 +125,11 @@ impl Server {
         thread::scope(|scope| {
             let _close = CloseOnDrop(&queue);
             let (queue, routes) = (&queue, &routes);
-            let no_thread = |error| {
+            let thread_error = |error| {
                 let problem = "--view: the system cannot start a thread for the page";
                 Failure::new(OTHER, format!("{problem}: {error}"))
             };
-            let encoder = encoder::start(scope, queue, &scene).map_err(no_thread)?;
+            let encoder = encoder::start(scope, queue, &scene).map_err(thread_error)?;
             let server = thread::Builder::new().stack_size(STACK).spawn_scoped(scope, move || {
                 let _close = CloseOnDrop(queue);
                 let respond = |request: &http::Request| routes.respond(request);
@@ -139,7 +140,7 @@ impl Server {
                     );
                 }
             });
-            server.map_err(no_thread)?;
+            server.map_err(thread_error)?;
             let (run_status, scene, step) = (&run_status, &scene, Cell::new(0));
             let live = LiveObserver { observer, queue, run_status, scene, rows, signals, step };
             let trained = train(run, &live);
@@ -166,7 +167,7 @@ struct LiveObserver<'a> {
 }
 
 impl LiveObserver<'_> {
-    /// Renders the next requested picture, waiting for a request at most this long.
+    /// Renders the next requested picture; waits for a request, but no longer than `timeout`.
     fn render_next(&self, model: &mut dyn Backend, rows: Option<&RowHistory>, timeout: Duration) {
         if let Some(job) = self.queue.next_within(timeout) {
             let history = rows.map(|rows| (rows, self.step.get()));

@@ -97,10 +97,10 @@ pub fn open(
         loaded
     } else if is_run(path) {
         let (model, config, iteration) = read_run(path, iteration, antialias, observer)?;
-        let is_named = dataset.is_some();
+        let is_given = dataset.is_some();
         let folder = dataset.unwrap_or_else(|| config.scene_path());
         let dataset = load(&folder, &config.spec.data, observer)
-            .map_err(|failure| if is_named { failure } else { or_moved(failure, &folder) })?;
+            .map_err(|failure| if is_given { failure } else { or_moved(failure, &folder) })?;
         near = near_plane_of_run(&config, &dataset, observer);
         let mut loaded = scene_of_dataset(machine, path, dataset, &config.spec.data);
         let name = format!("{}, iteration {iteration}", names[0]);
@@ -211,7 +211,7 @@ fn scene_without_cameras(
     let points = PointCloud::default();
     let background = data.background.fixed();
     let mut scene = Scene::new(machine, name_of(path), normalisation, background, views, points);
-    // Slightly from above, with y pointing down as in structure from motion.
+    // The camera looks slightly from above; y points down, as in structure from motion.
     let turn = DMat3::from_rotation_x(-0.25);
     let centre = turn * DVec3::new(0.0, 0.0, -2.5);
     let key = Keyframe::looking_at(centre, DVec3::ZERO, DVec3::NEG_Y, FOV);

@@ -41,7 +41,7 @@ pub(super) enum PictureKind {
 pub(super) struct Legend {
     pub(super) kind: PictureKind,
     pub(super) label: &'static str,
-    /// One sentence on what is seen.
+    /// One sentence on what the picture shows.
     about: &'static str,
     needs_photograph: bool,
     /// The unit of the numbers that the colours represent, if they do.

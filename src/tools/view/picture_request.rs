@@ -15,7 +15,7 @@ pub(super) const MAX_PIXELS: u64 = 1 << 22;
 /// Maximum number of characters of a page's identifier.
 const MAX_NAME: usize = 32;
 /// Allowed fields of view `[°]`; beyond these nothing is recognisable.
-const FIELDS: std::ops::RangeInclusive<f64> = 1.0..=170.0;
+const FIELDS_OF_VIEW: std::ops::RangeInclusive<f64> = 1.0..=170.0;
 /// Largest distance of a camera from the scene's centre, in scene radii; far beyond, single precision cannot
 /// distinguish Gaussians.
 const FARTHEST: f64 = 1e4;
@@ -87,7 +87,7 @@ pub(super) enum Viewpoint {
 /// Parses and validates the body of a picture request.
 pub(super) fn parse(body: &[u8], scene: &Scene) -> Result<PictureRequest, Response> {
     let body: RequestBody = serde_json::from_slice(body).map_err(|error| {
-        Response::error(400, format_args!("this is no picture request: {error}"))
+        Response::error(400, format_args!("this is not a picture request: {error}"))
     })?;
     check(body, scene).map_err(|message| Response::error(400, message))
 }
@@ -134,13 +134,13 @@ fn check(body: RequestBody, scene: &Scene) -> Result<PictureRequest, String> {
 
 fn parse_camera(camera: &CameraBody, scene: &Scene) -> Result<Keyframe, String> {
     let key = camera_path::parse_keyframe(&camera.camera_to_world, camera.fov)?;
-    if !FIELDS.contains(&camera.fov) {
-        let (least, most) = (FIELDS.start(), FIELDS.end());
+    if !FIELDS_OF_VIEW.contains(&camera.fov) {
+        let (least, most) = (FIELDS_OF_VIEW.start(), FIELDS_OF_VIEW.end());
         return Err(format!("fov is {}; it must be {least} to {most} degrees", camera.fov));
     }
-    let away = scene.normalisation.scene_from_world(key.centre).length();
+    let distance = scene.normalisation.scene_from_world(key.centre).length();
     // The comparison is also false for NaN.
-    if away <= FARTHEST { Ok(key) } else { Err("the camera is too far from the scene".into()) }
+    if distance <= FARTHEST { Ok(key) } else { Err("the camera is too far from the scene".into()) }
 }
 
 #[cfg(test)]
@@ -205,14 +205,14 @@ mod tests {
             (json!({ "width": 100_000 }), "100000x480 px"),
             (json!({ "width": 4096, "height": 4096 }), "4194304 pixels"),
             (json!({ "width": 0 }), "0x480 px"),
-            (json!({ "width": -1 }), "no picture"),
-            (json!({ "height": 1e300 }), "no picture"),
+            (json!({ "width": -1 }), "not a picture"),
+            (json!({ "height": 1e300 }), "not a picture"),
             (json!({ "page": "" }), "page"),
             (json!({ "page": "../../etc" }), "page"),
             (json!({ "page": "a".repeat(33) }), "page"),
             (json!({ "place": 2 }), "place"),
             (json!({ "model": 2 }), "model"),
-            (json!({ "kind": "shadow" }), "no picture"),
+            (json!({ "kind": "shadow" }), "not a picture"),
             (json!({ "kind": "count" }), "GPU"),
             (json!({ "kind": "row_age" }), "trains"),
             (json!({ "path": "/etc/passwd" }), "unknown field"),
@@ -221,14 +221,14 @@ mod tests {
             (json!({ "kind": "photograph" }), "photograph"),
             (view("train", 1), "1 such views"),
             (view("test", 0), "0 such views"),
-            (view("test", -1), "no picture"),
-            (view("../test", 0), "no picture"),
+            (view("test", -1), "not a picture"),
+            (view("../test", 0), "not a picture"),
             (pose(0, -1.0), "mirrors"),
             (pose(3, 1e30), "too far"),
             (pose(3, 1e308), "too far"),
             (json!({ "camera": { "camera_to_world": [1, 2], "fov": 50 } }), "2 numbers"),
             (json!({ "camera": { "camera_to_world": vec![1; 17], "fov": 50 } }), "17 numbers"),
-            (json!({ "camera": { "camera_to_world": [1, "a"], "fov": 50 } }), "no picture"),
+            (json!({ "camera": { "camera_to_world": [1, "a"], "fov": 50 } }), "not a picture"),
         ] {
             let error = parse_changed(&scene, changes.clone()).expect_err(&changes.to_string());
             assert!(error.starts_with("400 ") && error.contains(reason), "{changes}: {error}");

@@ -88,7 +88,7 @@ pub(super) fn render(
     Ok(RenderedPicture { measured_views: progress, milliseconds: milliseconds(begun), ..rendered })
 }
 
-/// Reads from the run's checkpoint when each Gaussian was edited.
+/// Reads from the run's checkpoint when each Gaussian was last edited.
 fn read_edits(model: &ModelInfo) -> Result<Option<(RowHistory, u32)>, CheckpointError> {
     let Some(path) = &model.checkpoint else { return Ok(None) };
     let mut checkpoint = Checkpoint::open(path)?;

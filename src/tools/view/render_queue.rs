@@ -123,7 +123,7 @@ impl RenderQueue {
         self.wait_for(|jobs| self.take(jobs))
     }
 
-    /// The next job to render, waiting for it at most this long.
+    /// Waits for the next job to render, but no longer than `timeout`.
     pub(super) fn next_within(&self, timeout: Duration) -> Option<Job> {
         let mut jobs = self.lock();
         if let Some(job) = self.take(&mut jobs) {

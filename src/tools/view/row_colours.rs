@@ -1,4 +1,4 @@
-//! Colours for the Gaussians of a model that represent one of their properties.
+//! Colours the Gaussians of a model by one of their properties.
 
 use std::ops::Range;
 
@@ -268,9 +268,9 @@ mod tests {
         }
         let age = colour_rows(PictureKind::RowAge, backend.as_mut(), row_data, UNITS).unwrap();
         assert_eq!(age.range, Some(0.0..10.0), "an update creates no Gaussian");
-        let own = colour_rows(PictureKind::Rows, backend.as_mut(), row_data, UNITS).unwrap();
-        assert!(own.range.is_none());
-        assert_ne!(own.rows[0].map(f32::to_bits), own.rows[1].map(f32::to_bits));
+        let distinct = colour_rows(PictureKind::Rows, backend.as_mut(), row_data, UNITS).unwrap();
+        assert!(distinct.range.is_none());
+        assert_ne!(distinct.rows[0].map(f32::to_bits), distinct.rows[1].map(f32::to_bits));
     }
 
     #[test]

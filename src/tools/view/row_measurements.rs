@@ -64,7 +64,7 @@ impl RowMeasurements {
         [self.seen, self.order.len()]
     }
 
-    /// Measures at least one more view, and further ones until this time has passed.
+    /// Measures at least one more view, and further ones until `duration` has passed.
     pub(super) fn measure_more(
         &mut self,
         scene: &Scene,
@@ -165,10 +165,10 @@ mod tests {
             assert_eq!(measured.progress(), [views, 2]);
             let found = [positive(&measured.weight), positive(&measured.gradient)];
             assert_eq!(found, [views; 2], "{measured:?}");
-            let measures =
+            let unfinished =
                 measured.backend.as_ref().map(|backend| backend.download().expect("a model"));
-            assert_eq!(measures.is_none(), views == 2, "the backend outlives the last view");
-            assert!(measures.is_none_or(|measures| measures == model), "measuring has trained");
+            assert_eq!(unfinished.is_none(), views == 2, "the backend outlives the last view");
+            assert!(unfinished.is_none_or(|rest| rest == model), "measuring changed the model");
         }
         let before = (measured.weight.clone(), measured.gradient.clone());
         measured.measure_more(&scene, 0, Duration::ZERO).expect("nothing to do");

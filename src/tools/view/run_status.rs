@@ -64,15 +64,16 @@ struct Progress {
     /// One of this many records is kept as a point.
     #[serde(skip)]
     stride: usize,
+    /// Number of records so far.
     #[serde(skip)]
     records: usize,
-    /// PSNR of the test views.
+    /// Steps at which the test views were evaluated, with their mean PSNR `[dB]`.
     tests: Vec<(u32, f64)>,
     /// The newest edits, the oldest first.
     edits: VecDeque<EditEvent>,
     /// Step of the newest checkpoint.
     checkpoint: Option<u32>,
-    /// The last failure of a command.
+    /// The reason why the last checkpoint could not be written, if it failed.
     trouble: Option<String>,
 }
 

@@ -65,7 +65,7 @@ pub(super) struct Scene {
     pub(super) models: Vec<ModelInfo>,
     /// Kinds of pictures that this scene cannot show, with the reasons.
     pub(super) unavailable: Vec<(PictureKind, String)>,
-    /// Largest picture `[px]`: beside a run, the size that its memory was planned for.
+    /// Maximum size of a picture `[px]`: beside a run in training, memory is planned for no larger one.
     pub(super) largest: Option<(u32, u32)>,
     pub(super) normalisation: Normalisation,
     pub(super) background: [f32; 3],

@@ -18,7 +18,7 @@ pub struct Fingerprint {
     pub train: ViewsFingerprint,
     /// Views held out.
     pub test: ViewsFingerprint,
-    /// Transform from the dataset's coordinates to normalised ones.
+    /// Transform from the dataset's coordinates to normalised coordinates.
     pub normalisation: Normalisation,
 }
 

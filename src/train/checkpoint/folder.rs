@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use super::{Checkpoint, CheckpointError};
 use crate::output::CHECKPOINTS;
 
-/// Number of checkpoints kept, as the newest may turn out to be damaged.
+/// Number of checkpoints kept; more than one, because the newest may turn out to be damaged.
 const MAX_CHECKPOINTS: usize = 2;
 
 /// Path of the checkpoint of a step.
@@ -21,11 +21,11 @@ fn list(run: &Path) -> Vec<(u32, PathBuf)> {
         name.to_str()?.strip_prefix("iteration_")?.strip_suffix(".safetensors")?.parse().ok()
     };
     let entries = fs::read_dir(run.join(CHECKPOINTS)).into_iter().flatten().flatten();
-    let mut found: Vec<(u32, PathBuf)> =
+    let mut checkpoints: Vec<(u32, PathBuf)> =
         entries.filter_map(|entry| Some((step(&entry.file_name())?, entry.path()))).collect();
-    found.sort_unstable();
-    found.reverse();
-    found
+    checkpoints.sort_unstable();
+    checkpoints.reverse();
+    checkpoints
 }
 
 /// The step of the newest checkpoint of a run, which may be damaged.

@@ -14,7 +14,7 @@ pub(super) const CHECKSUM_KEY: &str = "densify.crc32c";
 /// Size of the field that states the header's length `[bytes]`.
 pub(super) const LENGTH_FIELD_BYTES: u64 = 8;
 
-/// Description of an array.
+/// Description of an array in the file.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Record {

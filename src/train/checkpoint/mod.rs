@@ -10,8 +10,8 @@
 //! header in eight bytes, a JSON header, and arrays. The arrays of the model are `model.means`, `model.log_scales`,
 //! `model.quats`, `model.opacity_logits`, `model.sh` ([`Gaussians`](densify_core::gaussians::Gaussians), in the
 //! coordinates of training); the others are the [backend's](densify_render::Backend::state). The rest is JSON in the
-//! metadata of the header: the version of the format, [`Header`], the arrays with a checksum each (CRC-32C), and a
-//! checksum of that JSON. Every byte is therefore checked before it is used.
+//! metadata of the header: the version of the format, [`Header`], a description of each array with its checksum
+//! (CRC-32C), and a checksum of that JSON. Every byte is therefore checked before it is used.
 //!
 //! A file appears under its name only when it is complete and synced to disk. Files are untrusted: sizes
 //! are checked against the length of the file before anything is allocated.
@@ -66,7 +66,7 @@ pub enum CheckpointError {
     Invalid {
         /// The file.
         path: PathBuf,
-        /// The damaged part and the fault.
+        /// What is wrong, and in which part of the file.
         problem: String,
     },
     /// The file cannot be read or written.

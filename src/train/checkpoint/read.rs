@@ -28,7 +28,7 @@ pub struct Checkpoint {
     file: File,
     header: Header,
     /// Offset and description of each array.
-    places: Vec<(u64, Record)>,
+    arrays: Vec<(u64, Record)>,
 }
 
 impl Checkpoint {
@@ -58,9 +58,9 @@ impl Checkpoint {
         }
         let mut bytes = vec![0; length as usize];
         file.read_exact(&mut bytes).map_err(failed)?;
-        let (header, places) = parse(&bytes, LENGTH_FIELD_BYTES + length, size).map_err(invalid)?;
-        let mut checkpoint = Self { path: path.to_owned(), file, header, places };
-        for i in 0..checkpoint.places.len() {
+        let (header, arrays) = parse(&bytes, LENGTH_FIELD_BYTES + length, size).map_err(invalid)?;
+        let mut checkpoint = Self { path: path.to_owned(), file, header, arrays };
+        for i in 0..checkpoint.arrays.len() {
             ArrayReader::new(&mut checkpoint, i)?.finish()?;
         }
         Ok(checkpoint)
@@ -76,7 +76,7 @@ impl Checkpoint {
         &self.header
     }
 
-    /// A model of zeros with the checkpoint's size, for creating the backend that is then
+    /// A model of zeros with as many rows as the checkpoint, for creating the backend that is then
     /// [restored](Self::restore).
     ///
     /// # Errors
@@ -86,30 +86,30 @@ impl Checkpoint {
         if sh_degree > MAX_SH_DEGREE {
             return Err(self.invalid(format!("sh_degree is {sh_degree}; at most {MAX_SH_DEGREE}")));
         }
-        let means = self.place(name_of(ModelArray::Means))?;
-        let rows = self.places[means].1.shape.first().copied().unwrap_or(0);
+        let means = self.index_of(name_of(ModelArray::Means))?;
+        let rows = self.arrays[means].1.shape.first().copied().unwrap_or(0);
         if rows > budget {
             return Err(self.invalid(format!("{rows} rows, but its budget is {budget}")));
         }
         for array in ModelArray::ALL {
-            self.place_in_model(array, rows, sh_degree)?;
+            self.index_in_model(array, rows, sh_degree)?;
         }
         Ok(Gaussians::zeros(rows, sh_degree))
     }
 
     /// Index of an array of the model, after checking its shape.
-    fn place_in_model(
+    fn index_in_model(
         &self,
         array: ModelArray,
         rows: usize,
         sh_degree: u8,
     ) -> Result<usize, CheckpointError> {
         let name = name_of(array);
-        let place = self.place(name)?;
-        let Record { shape, kind, .. } = &self.places[place].1;
+        let index = self.index_of(name)?;
+        let Record { shape, kind, .. } = &self.arrays[index].1;
         let needed = shape_of(array, rows, sh_degree);
         if (shape, *kind) == (&needed, Dtype::F32) {
-            return Ok(place);
+            return Ok(index);
         }
         Err(self.invalid(format!(
             "tensor `{name}`: it is {kind:?} of shape {shape:?}; this run needs F32 of {needed:?}"
@@ -128,7 +128,7 @@ impl Checkpoint {
             ModelArray::ALL.into_iter().any(|array| name_of(array) == name)
                 || expected.iter().any(|array| array.name == name)
         };
-        if let Some((_, record)) = self.places.iter().find(|(_, record)| !known(&record.name)) {
+        if let Some((_, record)) = self.arrays.iter().find(|(_, record)| !known(&record.name)) {
             let name = &record.name;
             return Err(
                 self.invalid(format!("it has a tensor `{name}`, which this run does not have"))
@@ -138,8 +138,8 @@ impl Checkpoint {
         let refused = |error: StateError| CheckpointError::invalid(&path, error);
         let (rows, sh_degree) = (backend.rows(), backend.sh_degree());
         for array in ModelArray::ALL {
-            let place = self.place_in_model(array, rows, sh_degree)?;
-            let mut reader = ArrayReader::new(self, place)?;
+            let index = self.index_in_model(array, rows, sh_degree)?;
+            let mut reader = ArrayReader::new(self, index)?;
             for rows in pieces(rows) {
                 let shape = shape_of(array, rows.len(), sh_degree);
                 let values = reader.tensor(rows.len())?.into_f32(&shape).map_err(&refused)?;
@@ -148,17 +148,17 @@ impl Checkpoint {
             reader.finish()?;
         }
         for StateArray { name, by_rows } in expected {
-            let place = self.place(&name)?;
-            let has_rows = self.places[place].1.shape.first() == Some(&rows);
+            let index = self.index_of(&name)?;
+            let has_rows = self.arrays[index].1.shape.first() == Some(&rows);
             if has_rows && by_rows {
-                let mut reader = ArrayReader::new(self, place)?;
+                let mut reader = ArrayReader::new(self, index)?;
                 for rows in pieces(rows) {
                     backend.restore_rows(reader.tensor(rows.len())?, rows).map_err(&refused)?;
                 }
                 reader.finish()?;
             } else {
-                // This refuses an array with one entry per row if its number of rows is wrong.
-                backend.restore(self.tensor(place)?).map_err(&refused)?;
+                // `restore` refuses an array with one entry per row if its number of rows is wrong.
+                backend.restore(self.tensor(index)?).map_err(&refused)?;
             }
         }
         Ok(())
@@ -169,8 +169,8 @@ impl Checkpoint {
     /// # Errors
     /// [`CheckpointError::Invalid`] if the checkpoint has no ages, [`CheckpointError::File`].
     pub fn ages(&mut self) -> Result<Vec<u32>, CheckpointError> {
-        let place = self.places.iter().position(|(_, record)| Tensor::has_ages(&record.name));
-        let tensor = place.map(|place| self.tensor(place)).transpose()?;
+        let index = self.arrays.iter().position(|(_, record)| Tensor::has_ages(&record.name));
+        let tensor = index.map(|index| self.tensor(index)).transpose()?;
         let ages = tensor.and_then(|tensor| tensor.ages());
         ages.ok_or_else(|| self.invalid("it has no ages of rows"))
     }
@@ -179,15 +179,15 @@ impl Checkpoint {
         CheckpointError::invalid(&self.path, problem)
     }
 
-    /// Index of an array in `places`.
-    fn place(&self, name: &str) -> Result<usize, CheckpointError> {
-        let found = self.places.iter().position(|(_, record)| record.name == name);
-        found.ok_or_else(|| self.invalid(format!("there is no tensor `{name}`")))
+    /// Index of an array in `arrays`.
+    fn index_of(&self, name: &str) -> Result<usize, CheckpointError> {
+        let index = self.arrays.iter().position(|(_, record)| record.name == name);
+        index.ok_or_else(|| self.invalid(format!("there is no tensor `{name}`")))
     }
 
     /// Reads a whole array.
-    fn tensor(&mut self, place: usize) -> Result<Tensor, CheckpointError> {
-        let mut reader = ArrayReader::new(self, place)?;
+    fn tensor(&mut self, index: usize) -> Result<Tensor, CheckpointError> {
+        let mut reader = ArrayReader::new(self, index)?;
         let whole = reader.tensor(reader.record.shape.first().copied().unwrap_or(0))?;
         reader.finish()?;
         Ok(whole)
@@ -206,9 +206,9 @@ struct ArrayReader<'a> {
 }
 
 impl<'a> ArrayReader<'a> {
-    fn new(checkpoint: &'a mut Checkpoint, place: usize) -> Result<Self, CheckpointError> {
-        let Checkpoint { path, file, places, .. } = checkpoint;
-        let (start, record) = &places[place];
+    fn new(checkpoint: &'a mut Checkpoint, index: usize) -> Result<Self, CheckpointError> {
+        let Checkpoint { path, file, arrays, .. } = checkpoint;
+        let (start, record) = &arrays[index];
         let left = record.bytes().unwrap_or(usize::MAX);
         let reader = Self { path, file, record, left, crc: 0 };
         reader.file.seek(SeekFrom::Start(*start)).map_err(|e| reader.failed(e))?;
@@ -233,14 +233,14 @@ impl<'a> ArrayReader<'a> {
             Dtype::U16 => Values::U16(self.values(count, u16::from_le_bytes)?),
             Dtype::U8 => Values::U8(self.values(count, |[byte]: [u8; 1]| byte)?),
             other => {
-                let problem = format!("tensor `{name}` is of type {other:?}");
+                let problem = format!("tensor `{name}` has the unsupported type {other:?}");
                 return Err(CheckpointError::invalid(self.path, problem));
             }
         };
         Ok(Tensor { name: name.clone(), shape, values })
     }
 
-    /// Reads `count` bytes in pieces of whole values.
+    /// Reads `count` bytes, and passes them to `sink` in pieces of whole values.
     fn bytes(&mut self, count: usize, mut sink: impl FnMut(&[u8])) -> Result<(), CheckpointError> {
         let mut left = count;
         let mut buffer = vec![0; left.min(CHUNK)];
@@ -311,7 +311,7 @@ fn parse(bytes: &[u8], start: u64, size: u64) -> Result<(Header, Vec<(u64, Recor
     if tensors.len() != table.offset_keys().len() {
         return Err("its header is damaged: it lists other tensors than the file has".to_owned());
     }
-    let mut places = Vec::new();
+    let mut arrays = Vec::new();
     let mut end = start;
     for record in tensors {
         let info = table.info(&record.name);
@@ -328,12 +328,12 @@ fn parse(bytes: &[u8], start: u64, size: u64) -> Result<(Header, Vec<(u64, Recor
                 "its header is damaged: tensor `{name}` is not where it should be"
             ));
         };
-        places.push((end, record));
+        arrays.push((end, record));
         end = next;
     }
     if end != size {
         let how = if size < end { "it is cut short" } else { "it is too long" };
-        return Err(format!("{how}: {size} bytes, its header says {end}"));
+        return Err(format!("{how}: it has {size} bytes, but its header says {end}"));
     }
-    Ok((header, places))
+    Ok((header, arrays))
 }

@@ -19,7 +19,7 @@ use densify_render::Setup;
 use densify_render::cpu::CpuBackend;
 use densify_render::{Backend, StateArray, Tensor, Values};
 
-/// Few, so that every byte of a file can be damaged in turn.
+/// Number of rows: few, so that every byte of a file can be damaged in turn.
 const ROWS: usize = 61;
 
 fn numbers(count: usize, seed: f32) -> Vec<f32> {
@@ -286,13 +286,13 @@ fn the_newest_usable_checkpoint_is_found_and_two_are_kept() {
     assert_eq!(rejected.len(), 1);
     assert!(rejected[0].to_string().contains("iteration_100"));
     remove_older(run, 30);
-    let mut left: Vec<String> = std::fs::read_dir(run.join("checkpoints"))
+    let mut remaining: Vec<String> = std::fs::read_dir(run.join("checkpoints"))
         .unwrap()
         .map(|entry| entry.unwrap().file_name().into_string().unwrap())
         .collect();
-    left.sort();
+    remaining.sort();
     let [a, b, c] = [100, 17, 30].map(|n| format!("iteration_{n}.safetensors"));
-    assert_eq!(left, [&a, &b, &c, "notes.txt"]);
+    assert_eq!(remaining, [&a, &b, &c, "notes.txt"]);
     assert!(newest(&run.join("nowhere")).0.is_none());
 }
 
@@ -300,14 +300,14 @@ fn the_newest_usable_checkpoint_is_found_and_two_are_kept() {
 fn differences_of_datasets_are_named() {
     let one = header(ROWS).dataset;
     assert_eq!(one.difference(&one), None);
-    let with = |change: fn(&mut Fingerprint)| {
+    let after = |change: fn(&mut Fingerprint)| {
         let mut other = one.clone();
         change(&mut other);
         one.difference(&other).unwrap()
     };
-    assert_eq!(with(|f| f.train.count = 4), "3 views to train on, now 4");
-    assert_eq!(with(|f| f.test.names = 0), "the names of the views held out differ");
-    assert_eq!(with(|f| f.train.cameras = 0), "the cameras of the views to train on differ");
-    assert_eq!(with(|f| f.train.images = 0), "the image files of the views to train on differ");
-    assert!(with(|f| f.normalisation.scale = 2.0).contains("scale"));
+    assert_eq!(after(|f| f.train.count = 4), "3 views to train on, now 4");
+    assert_eq!(after(|f| f.test.names = 0), "the names of the views held out differ");
+    assert_eq!(after(|f| f.train.cameras = 0), "the cameras of the views to train on differ");
+    assert_eq!(after(|f| f.train.images = 0), "the image files of the views to train on differ");
+    assert!(after(|f| f.normalisation.scale = 2.0).contains("scale"));
 }

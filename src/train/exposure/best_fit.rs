@@ -56,7 +56,7 @@ impl Sums {
     fn line(&self) -> [f64; 2] {
         let Self { weight, x, y, xx, xy } = *self;
         let variance = xx * weight - x * x;
-        // A variance below (1e-4 / 255)² is rounding.
+        // A variance below (1e-4 / 255)² is due to rounding.
         let factor = if variance > weight * weight * 1.5e-13 {
             (xy * weight - x * y) / variance
         } else {

@@ -28,8 +28,8 @@ const BETA2: f32 = 0.99;
 /// being off by 1/255.
 const EPSILON: f32 = 1e-8;
 /// Weight of the squared differences from the identity in the loss. The rest of the loss rises by about five times the
-/// square of an error in a factor, so that the regularisation shifts a factor by less than a five-hundredth of its
-/// difference from 1.
+/// square of an error in a factor, so that the regularisation shifts a factor by less than 1/500 of its difference
+/// from 1.
 const REGULARISATION: f32 = 0.005;
 
 /// The exposures of all training views.
@@ -37,7 +37,7 @@ const REGULARISATION: f32 = 0.005;
 #[serde(deny_unknown_fields)]
 pub struct Exposures {
     model: ExposureModel,
-    /// Mean difference of the views from the identity, near 0, which is held constant. Shape: `[12]`.
+    /// Mean difference of the views' transforms from the identity, near 0; it is held constant. Shape: `[12]`.
     mean: [f32; PARAMETERS],
     views: Vec<ViewExposure>,
 }
@@ -100,7 +100,7 @@ impl Exposures {
         std::array::from_fn(|i| (f64::from(own[i]) - mean[i] + f64::from(self.mean[i])) as f32)
     }
 
-    /// Takes an Adam step for a view; `progress` is the elapsed share of the run. Non-finite gradients are ignored.
+    /// Takes an Adam step for a view; `progress` is the elapsed fraction of the run. Non-finite gradients are ignored.
     pub fn step(&mut self, view: usize, gradient: &ColourGradient, progress: f64) {
         let difference = self.difference(view);
         let mut numbers = [0.0; PARAMETERS];
@@ -160,12 +160,12 @@ fn mean(views: &[ViewExposure]) -> [f64; PARAMETERS] {
     sums.map(|sum| sum / views.len().max(1) as f64)
 }
 
-/// True if a parameter is learned: without mixing of channels, only the diagonal and the offsets are.
+/// True if a parameter is learned. [`ExposureModel::Channels`] learns only the diagonal and the offsets.
 fn is_learned(model: ExposureModel, number: usize) -> bool {
     model == ExposureModel::Matrix || number >= 9 || number.is_multiple_of(4)
 }
 
-/// The exposures by name of view, as JSON: 3x4 matrices that turn (r, g, b, 1) of the model into the colour of the
+/// The exposures by view name, as JSON: 3x4 matrices that turn (r, g, b, 1) of the model into the colour of the
 /// photograph.
 pub fn named_transforms<'a>(
     exposures: &Exposures,

@@ -1,10 +1,10 @@
 //! Exposures of photographs: affine transforms of the scene's colours, C' = matrix·C + offset, in sRGB-encoded values
 //! in `[0, 1]`.
 //!
-//! Cameras choose shutter time and white balance for each photograph. In linear light this is a factor per channel.
-//! Except for the darkest values the sRGB curve is 1.055·x^(1/2.4) − 0.055, so that on encoded values it acts
-//! exactly as a factor and an offset. INRIA's trainer uses the same form; with [`ExposureModel::Channels`] the matrix
-//! is diagonal.
+//! Cameras choose shutter time and white balance for each photograph. In linear light the choice is a factor per
+//! channel. Except for the darkest values, the sRGB curve is 1.055·x^(1/2.4) − 0.055, so that such a factor acts on
+//! encoded values exactly as a factor and an offset. INRIA's trainer uses the same form; with
+//! [`ExposureModel::Channels`] the matrix is diagonal.
 //!
 //! The background was not photographed, so it is composited after the transform. A renderer that transforms whole
 //! pixels achieves this by rendering over [`ColourTransform::behind`](densify_core::colour::ColourTransform::behind).

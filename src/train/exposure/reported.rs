@@ -8,7 +8,7 @@ use densify_data::track_colours::exposures::STOPS;
 
 /// Smallest number of photographs with both EXIF and track colours for a comparison.
 const MIN_COMPARED: usize = 3;
-/// Largest difference between EXIF and track colours, as a share of the larger of their spreads.
+/// Largest accepted difference between EXIF and track colours, as a fraction of the larger of their spreads.
 const MAX_DIFFERENCE: f64 = 0.5;
 /// A difference that is accepted even if the spreads are small `[stops]`.
 const NEGLIGIBLE_DIFFERENCE: f64 = 0.3;
@@ -28,7 +28,7 @@ pub enum ExifUse {
 }
 
 /// Sets the gains of views without `known` track colours from exposures in EXIF `[stops]`. Afterwards the geometric
-/// mean of all known gains is 1.
+/// mean of all gains from track colours or EXIF is 1.
 ///
 /// # Panics
 /// When the slices have different lengths.

@@ -20,12 +20,12 @@ use densify_data::dataset::PointCloud;
 use densify_data::dataset::normalise::EXTENT;
 pub use random::random_points;
 
-/// Diameter D of a normalised scene `[scene units]`; scales and floors are relative to it.
+/// Diameter D of a normalised scene `[scene units]`; the lengths below are relative to it.
 const SCENE_DIAMETER: f64 = 2.0 * EXTENT;
-/// Smallest root mean square distance used: points closer than 1e-4·D count as one surface sample. (The absolute floor
-/// of the original code would exceed the size of a scene of a few millimetres.)
+/// Lower bound of the root mean square distance, because points closer than 1e-4·D count as one surface sample. (The
+/// absolute bound of the original code would exceed the size of a scene of a few millimetres.)
 const DISTANCE_FLOOR: f64 = 1e-4 * SCENE_DIAMETER;
-/// Standard deviation for a single point.
+/// Standard deviation of a Gaussian that is alone, and so has no neighbours `[scene units]`.
 const SINGLE_POINT_SCALE: f64 = 0.01 * SCENE_DIAMETER;
 /// Initial opacity.
 const OPACITY: f64 = 0.1;
@@ -38,7 +38,7 @@ const COLOUR_MARGIN: f64 = 1.0 / 510.0;
 pub struct InitReport {
     /// Number of points before initialisation.
     pub points: usize,
-    /// Points dropped because another has exactly the same position.
+    /// Points dropped because another point has exactly the same position.
     pub duplicates: usize,
     /// Points dropped because they are not finite in f32.
     pub unusable: usize,
@@ -54,7 +54,7 @@ pub enum InitError {
     /// The budget is 0.
     #[error("the budget is 0 Gaussians; it must be at least 1")]
     NoBudget,
-    /// There is no such degree.
+    /// The spherical-harmonic degree is not supported.
     #[error("spherical-harmonic degree {0} is not one of 0 to 3")]
     Degree(u8),
     /// No point has a finite position.
@@ -147,7 +147,7 @@ pub fn apply_start_rule(model: &mut Gaussians, rule: &StartRule) {
 
 /// Keeps the first of several points with the same position.
 fn drop_duplicates(chosen: &mut Vec<usize>, positions: &[DVec3]) {
-    // −0 equals 0.
+    // Adding 0 turns −0 into 0, so that equal positions have equal bits.
     let key = |i: usize| positions[i].to_array().map(|v| (v + 0.0).to_bits());
     let mut order = chosen.clone();
     order.par_sort_unstable_by_key(|&i| (key(i), i));

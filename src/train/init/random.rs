@@ -14,7 +14,8 @@ const HALF_CUBE: f64 = 1.0 / 3.0;
 const BACKGROUND_DEPTHS: (f64, f64) = (2.0 / 3.0, 4.0);
 /// Depths in scenes without a focus `[scene units]`; the cameras are within a radius of 1.
 const FREE_DEPTHS: (f64, f64) = (0.25, 5.0);
-/// Smallest value of a random colour, and width of the range of values: the middle half, away from clamping.
+/// Smallest channel value of a random colour, and width of the range: the middle half of the values, away from
+/// clamping.
 const COLOURS: (u8, u8) = (64, 128);
 
 /// Random points in view of the cameras, in normalised coordinates, with random colours.

@@ -19,7 +19,7 @@ fn scattered(count: usize, seed: u64) -> PointCloud {
     cloud(&(0..count).map(|_| [unit(), 2.0 * unit(), 0.1 * unit()]).collect::<Vec<_>>())
 }
 
-/// The point from which each row was created.
+/// The index of the point from which each row was created.
 fn origins(model: &Gaussians, points: &PointCloud) -> Vec<usize> {
     let origin = |mean: &[f32; 3]| {
         points.positions.iter().position(|p| p.as_vec3().to_array() == *mean).unwrap()
@@ -32,12 +32,12 @@ fn rows_follow_a_curve_through_space() {
     let points = scattered(1000, 4);
     let (model, _) = initialise(&points, 1000, 0, 0).unwrap();
     let mut origins = origins(&model, &points);
-    let step = |rows: &[usize]| -> f64 {
-        rows.windows(2).map(|w| points.positions[w[0]].distance(points.positions[w[1]])).sum()
+    let path_length = |order: &[usize]| -> f64 {
+        order.windows(2).map(|w| points.positions[w[0]].distance(points.positions[w[1]])).sum()
     };
     origins.dedup();
     let in_order: Vec<usize> = (0..1000).collect();
-    assert!(step(&origins) < 0.2 * step(&in_order), "{} {}", step(&origins), step(&in_order));
+    assert!(path_length(&origins) < 0.2 * path_length(&in_order));
     origins.sort_unstable();
     assert_eq!(origins, in_order);
 }

@@ -25,7 +25,7 @@ pub enum MetricError {
         "an image of {width}x{height} px is too small for LPIPS; its sides must have at least {least} px"
     )]
     TooSmall {
-        /// Smallest side `[px]`.
+        /// Smallest side that the network accepts `[px]`.
         least: usize,
         /// The target's width `[px]`.
         width: u32,

@@ -27,11 +27,11 @@ use rayon::{ThreadPool, ThreadPoolBuilder};
 
 use densify_core::image::Image8;
 
-/// Rows of pixels filtered together: few enough that their buffers take a few megabytes, and so many
-/// that the rows around a block, which its neighbours filter as well, are less than half of the work.
+/// Number of pixel rows filtered together: few enough that the buffers take only a few megabytes, but so many that the
+/// rows around a block, which the neighbouring blocks filter as well, are less than half of the work.
 const BLOCK: usize = 32;
-/// Number of blocks filtered in parallel, so that memory does not grow with the number of processor cores. Blocks have
-/// their own threads, because the allocator keeps the buffers of every thread that ever filtered one.
+/// Largest number of blocks filtered in parallel, so that memory does not grow with the number of processor cores.
+/// Blocks have their own threads, because the allocator keeps the buffers of every thread that ever filtered a block.
 const PARALLEL_BLOCKS: usize = 4;
 static THREADS: LazyLock<Option<ThreadPool>> = LazyLock::new(|| {
     let threads = rayon::current_num_threads().min(PARALLEL_BLOCKS);
@@ -54,7 +54,7 @@ fn by_blocks<T: Send>(height: usize, function: impl Fn(Range<usize>) -> T + Sync
     }
 }
 
-/// Adds pairs of a weighted error and its weight, in order.
+/// Adds up pairs of a weighted error and its weight, in order.
 ///
 /// # Errors
 /// When the total weight is 0.
@@ -95,7 +95,7 @@ impl<'a> Pair<'a> {
         Ok(Self { rendered, target, background: background.map(f64::from), width, height })
     }
 
-    /// Weight of pixel `p` by the mask, in `[0, 1]`.
+    /// Weight that the mask gives pixel `p`, in `[0, 1]`.
     fn weight(&self, p: usize) -> f64 {
         self.target.mask.as_ref().map_or(1.0, |mask| f64::from(mask[p]) / 255.0)
     }

@@ -5,7 +5,7 @@ use rayon::prelude::*;
 use super::{MetricError, Pair, total};
 use densify_core::image::Image8;
 
-/// PSNR `[dB]` of a render against a target, from one mean over all pixels and channels of the image.
+/// PSNR `[dB]` of a render against a target, from the mean squared error over all pixels and channels.
 ///
 /// `rendered`: shape `[height, width, 3]`, clamped to `[0, 1]` here. Targets with coverage are composited on
 /// `background`, in `[0, 1]`. Infinite for equal images, NaN if the render contains a NaN.
@@ -23,13 +23,13 @@ pub fn psnr(rendered: &[f32], target: &Image8, background: [f32; 3]) -> Result<f
 
 /// PSNR `[dB]` of two renders of one view, both clamped to `[0, 1]`; infinite when they are equal.
 pub fn psnr_between(a: &[f32], b: &[f32]) -> f64 {
-    assert_eq!(a.len(), b.len(), "renders of one view");
+    assert_eq!(a.len(), b.len(), "the renders differ in size");
     let value = |v: f32| f64::from(v.clamp(0.0, 1.0));
     let squares = a.iter().zip(b).map(|(a, b)| (value(*a) - value(*b)).powi(2)).sum::<f64>();
     0.0 - 10.0 * (squares / a.len() as f64).log10()
 }
 
-/// Weighted squared error and weight of one row of pixels.
+/// Sums of the weighted squared errors and of the weights of one row of pixels.
 fn row(pair: &Pair<'_>, y: usize) -> [f64; 2] {
     let mut sum = [0.0; 2];
     for p in y * pair.width..(y + 1) * pair.width {
@@ -53,7 +53,7 @@ mod tests {
     }
 
     #[test]
-    fn uniform_errors_have_known_ratios() {
+    fn uniform_errors_have_a_known_psnr() {
         let black = target(7, 5, 0);
         for (value, expected) in [(0.1, 20.0), (0.01, 40.0), (1.0, 0.0), (0.5, 6.020_599_913)] {
             let measured = psnr(&[value; 105], &black, [0.0; 3]).unwrap();
@@ -68,7 +68,7 @@ mod tests {
     }
 
     #[test]
-    fn equal_images_have_an_infinite_ratio_and_the_render_is_clamped() {
+    fn equal_images_have_an_infinite_psnr_and_the_render_is_clamped() {
         let white = target(4, 4, 255);
         assert_eq!(psnr(&[1.0; 48], &white, [0.0; 3]), Ok(f64::INFINITY));
         assert_eq!(psnr(&[7.5; 48], &white, [0.0; 3]), Ok(f64::INFINITY));
@@ -88,7 +88,7 @@ mod tests {
     }
 
     #[test]
-    fn masked_pixels_count_by_their_weight_and_ignored_ones_not_at_all() {
+    fn pixels_count_by_their_mask_weight() {
         let mut half = target(2, 1, 0);
         half.mask = Some(vec![255, 0]);
         let measured = psnr(&[0.1, 0.1, 0.1, f32::NAN, 1.0, 1.0], &half, [0.0; 3]).unwrap();
@@ -103,7 +103,7 @@ mod tests {
     }
 
     #[test]
-    fn sizes_that_disagree_are_refused() {
+    fn images_of_different_sizes_are_refused() {
         let (width, height) = (2, 2);
         let size =
             |part, found, expected| Err(MetricError::Size { part, found, expected, width, height });

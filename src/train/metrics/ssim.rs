@@ -60,7 +60,7 @@ fn window() -> [f64; 2 * RADIUS + 1] {
     window.map(|w| w / sum)
 }
 
-/// Values averaged over the window: e, y, e², x² + y².
+/// The averages of e, y, e² and x² + y² over the window.
 type Moments = [f64; 4];
 
 /// SSIM of rows `first..last`. Shape: `[last − first, width, 3]`.
@@ -173,7 +173,7 @@ mod tests {
         map
     }
 
-    /// Random target and a render that differs from it by up to `noise` per channel.
+    /// A render and a random target; they differ by up to `noise / 2` per channel.
     fn noisy(width: u32, height: u32, noise: f32, seed: u64) -> (Vec<f32>, Image8) {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         let n = (3 * width * height) as usize;

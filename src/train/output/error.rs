@@ -35,7 +35,7 @@ pub enum FolderError {
         /// The path.
         path: PathBuf,
     },
-    /// A folder is not that of a run.
+    /// The folder does not contain a run.
     #[error(
         "{} holds no run: it has no {missing}; name the folder that `densify train` wrote",
         folder.display()
@@ -43,7 +43,7 @@ pub enum FolderError {
     NoRun {
         /// The folder.
         folder: PathBuf,
-        /// The part of a run that it lacks.
+        /// The part of a run that is missing.
         missing: &'static str,
     },
     /// The path is a file that is not a model.
@@ -88,7 +88,7 @@ pub enum FolderError {
         staging: PathBuf,
         /// The folder with files of the old run, if they could not be moved back.
         aside: Option<PathBuf>,
-        /// The error of the file that could not be moved.
+        /// The error from the file that could not be moved.
         source: Box<FolderError>,
     },
     /// A file cannot be read or written.

@@ -44,9 +44,9 @@ impl FolderLock {
             }
             // The previous holder may have removed the file in the meantime.
             if is_at(&file, &path) {
-                let number = std::process::id().to_string();
+                let id = std::process::id().to_string();
                 // The lock works even if the id cannot be written.
-                let _ = file.set_len(0).and_then(|()| file.write_all(number.as_bytes()));
+                let _ = file.set_len(0).and_then(|()| file.write_all(id.as_bytes()));
                 return Ok(Self { path, file: Some(file) });
             }
         }
@@ -89,9 +89,9 @@ impl Drop for FolderLock {
 }
 
 fn in_use(folder: &Path, mut file: File) -> FolderError {
-    let mut number = String::new();
-    let read = file.rewind().and_then(|()| Read::take(&mut file, 32).read_to_string(&mut number));
-    let process = read.ok().and_then(|_| number.parse::<u32>().ok());
+    let mut id = String::new();
+    let read = file.rewind().and_then(|()| Read::take(&mut file, 32).read_to_string(&mut id));
+    let process = read.ok().and_then(|_| id.parse::<u32>().ok());
     FolderError::InUse { folder: folder.to_owned(), process }
 }
 
@@ -101,7 +101,7 @@ fn is_at(file: &File, path: &Path) -> bool {
     use std::os::unix::fs::MetadataExt;
     let same =
         |a: std::fs::Metadata, b: std::fs::Metadata| (a.dev(), a.ino()) == (b.dev(), b.ino());
-    file.metadata().is_ok_and(|open| path.metadata().is_ok_and(|there| same(open, there)))
+    file.metadata().is_ok_and(|open| path.metadata().is_ok_and(|at_path| same(open, at_path)))
 }
 
 #[cfg(not(unix))]

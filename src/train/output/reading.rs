@@ -14,10 +14,10 @@ use crate::trainer::EditEvent;
 use densify_core::files;
 use densify_core::files::FileError;
 
-/// Largest file that is read `[bytes]`.
+/// Size of the largest file that is read `[bytes]`.
 const MAX_BYTES: u64 = 256 << 20;
 
-/// The mean scores of an iteration on the test views, if it was evaluated.
+/// The mean scores of the test views at an iteration, if the model was evaluated then.
 ///
 /// # Errors
 /// When the file exists but cannot be read. This also holds for the other functions of this module.
@@ -25,7 +25,7 @@ pub fn scores_of(run: &Path, iteration: u32) -> Result<Option<Mean>, FileError> 
     entry_of(&run.join("results.json"), iteration)
 }
 
-/// The geometric measurements of an iteration on the test views, if it was measured.
+/// The geometric measurements in the test views at an iteration, if the model was measured then.
 pub fn geometry_of(run: &Path, iteration: u32) -> Result<Option<Geometry>, FileError> {
     entry_of(&run.join(geometry_file(Split::Test)), iteration)
 }
@@ -43,7 +43,7 @@ pub fn all_scores(run: &Path) -> Result<BTreeMap<u32, Mean>, FileError> {
     read_entries(&path)?.into_iter().map(score).collect()
 }
 
-/// The PSNR of each test view with the model of an iteration `[dB]`, by the view's name; empty if it was not evaluated.
+/// The PSNR of each test view at an iteration `[dB]`, by view name; empty if the model was not evaluated then.
 pub fn psnr_by_view(run: &Path, iteration: u32) -> Result<BTreeMap<String, f64>, FileError> {
     let path = run.join("per_view.json");
     let columns: Option<BTreeMap<String, BTreeMap<String, Option<f64>>>> =
@@ -78,12 +78,12 @@ pub fn read_json<T: DeserializeOwned>(path: &Path) -> Result<Option<T>, FileErro
 fn read_log<T: DeserializeOwned>(path: &Path) -> Result<Vec<T>, FileError> {
     let text = text_of(path)?.unwrap_or_default();
     // The last record may be incomplete while a process writes it.
-    let whole = text.rfind('\n').map_or("", |end| &text[..end]);
+    let complete = text.rfind('\n').map_or("", |end| &text[..end]);
     let record = |(at, line): (usize, &str)| {
         let record = serde_json::from_str(line);
         record.map_err(|e| FileError::malformed(path, format!("line {}: {e}", at + 1)))
     };
-    whole.lines().enumerate().map(record).collect()
+    complete.lines().enumerate().map(record).collect()
 }
 
 pub(super) fn geometry_file(split: Split) -> &'static str {

@@ -38,8 +38,8 @@ impl RecordLog {
         Ok(Self { file, path: path.to_owned() })
     }
 
-    /// Continues a log, truncated to the length that it had at the checkpoint. Also returns whether it was at least
-    /// that long; if it was shorter, the missing records stay lost.
+    /// Continues a log, truncated to the length that it had at the checkpoint. Also returns whether the file was at
+    /// least that long; if it was shorter, the missing records stay lost.
     ///
     /// # Errors
     /// [`FileError::Io`].
@@ -48,8 +48,8 @@ impl RecordLog {
             return Ok((Self::create(path)?, bytes == 0));
         };
         let mut cut = || {
-            let there = file.metadata()?.len();
-            if there < bytes {
+            let length = file.metadata()?.len();
+            if length < bytes {
                 // Keep complete lines only.
                 let mut text = Vec::new();
                 file.read_to_end(&mut text)?;
@@ -59,7 +59,7 @@ impl RecordLog {
                 file.set_len(bytes)?;
             }
             file.seek(SeekFrom::End(0))?;
-            Ok(there >= bytes)
+            Ok(length >= bytes)
         };
         let whole = cut().map_err(FileError::io("truncate", path))?;
         Ok((Self { file, path: path.to_owned() }, whole))
@@ -133,7 +133,7 @@ pub struct Summary {
     pub memory: Option<u64>,
     /// The ledger's total `[bytes]`.
     pub ledger_bytes: u64,
-    /// The ledger.
+    /// The bytes of every buffer.
     pub ledger: Ledger,
     /// Wall time of all steps `[s]`.
     pub seconds: f64,
@@ -217,9 +217,9 @@ pub fn write_geometry(
 }
 
 fn insert_entry(path: &Path, iteration: u32, entry: Value) -> Result<(), FileError> {
-    let mut all = read_entries(path)?;
-    all.insert(entry_name(iteration), entry);
-    write_json(path, &all)
+    let mut entries = read_entries(path)?;
+    entries.insert(entry_name(iteration), entry);
+    write_json(path, &entries)
 }
 
 #[cfg(test)]
@@ -275,14 +275,14 @@ mod tests {
         let path = root.path().join("stats/events.jsonl");
         let mut log = RecordLog::create(&path).unwrap();
         log.append(&1).unwrap();
-        let sound = log.synced().unwrap();
+        let bytes = log.synced().unwrap();
         log.append(&22).unwrap();
         let resume = |bytes| {
             let (mut log, whole) = RecordLog::resume(&path, bytes).unwrap();
             log.append(&3).unwrap();
             (std::fs::read_to_string(&path).unwrap(), whole)
         };
-        assert_eq!(resume(sound), ("1\n3\n".to_owned(), true));
+        assert_eq!(resume(bytes), ("1\n3\n".to_owned(), true));
         // The last line of a truncated log is incomplete.
         std::fs::write(&path, "1\n2").unwrap();
         assert_eq!(resume(9), ("1\n3\n".to_owned(), false));

@@ -46,9 +46,9 @@ impl TensorBoard {
     /// [`FileError::Io`].
     pub fn resume(folder: &Path, name: &str, bytes: u64) -> Result<Self, FileError> {
         let path = folder.join(name);
-        let ours = name.starts_with(PREFIX) && !name.contains(['/', '\\']);
-        let there = || path.symlink_metadata().is_ok_and(|m| m.is_file() && m.len() >= bytes);
-        if !ours || !there() {
+        let is_event_file = name.starts_with(PREFIX) && !name.contains(['/', '\\']);
+        let is_whole = || path.symlink_metadata().is_ok_and(|m| m.is_file() && m.len() >= bytes);
+        if !is_event_file || !is_whole() {
             return Self::create(folder);
         }
         let file = OpenOptions::new().append(true).open(&path);

@@ -33,7 +33,7 @@ pub struct RateOptions {
     pub log_scale: f32,
     /// Quaternions, ≥ 0.
     pub quat: f32,
-    /// Opacity logits, ≥ 0. The first release of 3DGS used 0.05; those since October 2024 use 0.025.
+    /// Opacity logits, ≥ 0. The first release of 3DGS used 0.05; releases since October 2024 use 0.025.
     pub opacity: f32,
     /// Spherical-harmonic coefficients of band 0, ≥ 0.
     pub sh_dc: f32,
@@ -52,7 +52,7 @@ pub struct RateOptions {
     /// Final factor of the step sizes of opacities and all spherical-harmonic coefficients, > 0. The factor is 1 up to
     /// `fade_from` and then changes log-linearly.
     pub fade: f64,
-    /// Share of the run after which these step sizes fade, in (0, 1].
+    /// Fraction of the run after which these step sizes fade, in (0, 1].
     pub fade_from: f64,
     /// Initial factor of all step sizes, > 0. It falls log-linearly to 1 at the end of the run, so that the last steps
     /// are as fine as in a long run.
@@ -92,9 +92,9 @@ impl RateOptions {
     /// Short runs must reach the same result in fewer steps. In measurements on three scenes at 2,000–3,000 iterations,
     /// the published step sizes left Gaussians far from their optimum, with training views as blurred as test views.
     /// View-dependent colour, which has the smallest steps and starts last, still lagged behind: twice its step size
-    /// gave +0.39, +0.23 and +0.18 dB (cup, three seeds), +0.20 (office), +0.59 (beercan) and −0.04 (room256); four
-    /// times gave less. It costs quality where colour does not depend on the view: −0.76 dB on the built-in
-    /// `scene:room`, where the published `sh_rest` of 1.25e-4 is better.
+    /// gave +0.39, +0.23 and +0.18 dB (cup, three seeds), +0.20 (office), +0.59 (beercan) and −0.04 (room256); a factor
+    /// of four gave less. The larger step size costs quality where colour does not depend on the view: −0.76 dB on the
+    /// built-in `scene:room`, where the published `sh_rest` of 1.25e-4 is better.
     pub fn for_run(iterations: u32) -> Self {
         let shortage = f64::from(REFERENCE_ITERATIONS) / f64::from(iterations.max(1));
         let boost = shortage.powf(0.6).clamp(1.0, 5.0);
@@ -149,7 +149,7 @@ impl RateOptions {
         rates
     }
 
-    /// Step sizes of iteration `step` (1-based), in a scene with an extent in `[scene units]`.
+    /// Step sizes of iteration `step` (1-based) in a scene of this extent `[scene units]`.
     pub fn at(&self, step: u32, iterations: u32, extent: f32) -> LearningRates {
         let t = f64::from(step.min(iterations)) / f64::from(iterations.max(1));
         let between = |start: f64, end: f64| {
@@ -174,7 +174,7 @@ impl RateOptions {
         }
     }
 
-    /// The name of the first invalid value, and the values allowed; `None` if all are valid.
+    /// A message with the name of the first invalid value and the values allowed; `None` if all values are valid.
     pub fn problem(&self) -> Option<String> {
         let end = |end: Option<f32>| f64::from(end.unwrap_or(1.0));
         let starts = [
@@ -323,7 +323,7 @@ pub fn view_order(views: usize, seed: u64, epoch: u32) -> Vec<usize> {
 }
 
 /// A random sample of `count` training views without replacement that depends on seed and step; all views if there are
-/// fewer. Used for views that are rendered for the policy's decisions and the automatic budget.
+/// fewer. These views are rendered for the policy's decisions and for the automatic budget.
 pub fn fresh_views(views: usize, count: usize, seed: u64, step: u32) -> Vec<usize> {
     let mut chosen: Vec<usize> = (0..views).collect();
     let mut draws = random_stream(seed, Purpose::FreshViews, u64::from(step));
@@ -341,7 +341,7 @@ pub(crate) fn sample(values: &mut Vec<usize>, count: usize, rng: &mut ChaCha8Rng
     values.truncate(count);
 }
 
-/// Purpose of random numbers. The streams of different purposes are independent.
+/// What random numbers are used for. The streams for different purposes are independent.
 #[derive(Debug, Clone, Copy)]
 enum Purpose {
     Views = 1,

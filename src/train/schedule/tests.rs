@@ -93,7 +93,7 @@ fn every_view_is_first_equally_often() {
     for epoch in 0..5_000 {
         first[view_order(5, 1, epoch)[0]] += 1;
     }
-    // Binomial(5,000, 1/5): mean 1,000, deviation 28; the bound is five deviations.
+    // Binomial(5,000, 1/5): mean 1,000, standard deviation 28; the bound is five standard deviations.
     assert!(first.iter().all(|n| n.abs_diff(1_000) < 142), "{first:?}");
 }
 
@@ -110,7 +110,7 @@ fn fresh_views_are_sampled_uniformly() {
             times[view] += 1;
         }
     }
-    // Binomial(7,000, 3/7): mean 3,000, deviation 41; the bound is five deviations.
+    // Binomial(7,000, 3/7): mean 3,000, standard deviation 41; the bound is five standard deviations.
     assert!(times.iter().all(|n| n.abs_diff(3_000) < 207), "{times:?}");
     assert_ne!(fresh_views(50, 10, 5, 3), fresh_views(50, 10, 6, 3));
     assert_ne!(fresh_views(50, 50, 5, 0), view_order(50, 5, 0));
@@ -145,7 +145,7 @@ fn backgrounds_have_the_expected_colours() {
     assert!(!same(random, Background::Random.at(2, 2)));
     let mean =
         (0..3_000).map(|step| f64::from(Background::Random.at(9, step)[1])).sum::<f64>() / 3_000.0;
-    // Uniform: deviation of the mean 0.29 / √3,000 = 0.005.
+    // The standard deviation of the mean is 0.29 / √3,000 = 0.005; the bound is five standard deviations.
     assert!((mean - 0.5).abs() < 0.025, "{mean}");
 }
 
@@ -195,14 +195,14 @@ fn fine_step_sizes_are_the_final_ones_throughout() {
     for rates in [RateOptions::for_run(2_000), with_ends] {
         let end = rates.at(2_000, 2_000, 3.0);
         for step in [1, 700, 2_000] {
-            let now = rates.fine().at(step, 2_000, 3.0);
+            let fine = rates.fine().at(step, 2_000, 3.0);
             for (found, expected) in [
-                (now.mean, end.mean),
-                (now.log_scale, end.log_scale),
-                (now.quat, end.quat),
-                (now.opacity, end.opacity),
-                (now.sh_dc, end.sh_dc),
-                (now.sh_rest, end.sh_rest),
+                (fine.mean, end.mean),
+                (fine.log_scale, end.log_scale),
+                (fine.quat, end.quat),
+                (fine.opacity, end.opacity),
+                (fine.sh_dc, end.sh_dc),
+                (fine.sh_rest, end.sh_rest),
             ] {
                 assert!(
                     (found - expected).abs() <= 1e-6 * expected,

@@ -12,7 +12,7 @@ use densify_core::budget::RowBudget;
 use densify_data::views::ViewSource;
 
 impl<V: ViewSource> Trainer<V> {
-    /// Lets the policy plan an edit, and executes the plan. `None` if nothing changed.
+    /// Lets the policy plan an edit, and executes the plan. Returns an event as [`Self::execute`] does.
     pub(super) fn edit(&mut self, step: u32) -> Result<Option<EditEvent>, TrainError> {
         let start = Instant::now();
         self.show_aux_views(step)?;
@@ -22,9 +22,9 @@ impl<V: ViewSource> Trainer<V> {
         let mut plan = self.new_plan().allowing(&self.needs);
         let scene = SceneInfo { budget: plan.budget(), ..self.scene.clone() };
         let candidates = self.backend.candidates();
-        let now = Snapshot { step, scene: &scene, signals: &signals, candidates };
+        let snapshot = Snapshot { step, scene: &scene, signals: &signals, candidates };
         let rng = PolicyRng::new(self.options.seed, step);
-        let planned = call_policy(|| self.policy.plan(&now, &rng, &mut plan)).and_then(|done| done);
+        let planned = call_policy(|| self.policy.plan(&snapshot, &rng, &mut plan)).flatten();
         self.backend.give_back(signals);
         planned.map_err(|source| self.policy_error(step, source))?;
         self.execute(step, plan)
@@ -41,7 +41,7 @@ impl<V: ViewSource> Trainer<V> {
         RowBudget { total: self.row_limit(), frozen: self.options.frozen }
     }
 
-    /// Number of rows and its limit, both as policies see them: without frozen rows.
+    /// Number of rows and its limit, both without frozen rows, as policies see them.
     pub(super) fn trained_rows_and_budget(&self) -> (usize, usize) {
         let budget = self.row_budget();
         (budget.trained(self.backend.rows()), budget.trainable())

@@ -55,9 +55,10 @@ pub struct Trainer<V> {
     order: Vec<usize>,
     /// Order of the views in the next epoch.
     next_order: Vec<usize>,
+    /// Wall time spent waiting for images.
     images_time: Duration,
     /// Training views in which the policy's scores are measured.
-    scored: Vec<usize>,
+    scored_views: Vec<usize>,
     /// Training views in which the automatic budget measures the PSNR; empty without it.
     probe_views: Vec<usize>,
     /// History of the rows, if it is recorded.
@@ -94,7 +95,7 @@ impl<V: ViewSource> Trainer<V> {
             policy,
             scene,
             options,
-            scored: (0..count).collect(),
+            scored_views: (0..count).collect(),
             probe_views: Vec::new(),
             history: None,
         })
@@ -108,7 +109,7 @@ impl<V: ViewSource> Trainer<V> {
             self.probe_views = auto_budget::probe_views(self.views.count(), self.options.seed);
         }
         if choices.scored_views {
-            self.scored = distinct_views(&self.views, self.scene.extent);
+            self.scored_views = distinct_views(&self.views, self.scene.extent);
         }
         let (rows, budget) = (self.backend.rows(), self.backend.budget());
         self.state.auto_budget = choices.rows.then(|| AutoBudget::new(rows, budget));
@@ -123,7 +124,7 @@ impl<V: ViewSource> Trainer<V> {
     #[must_use]
     pub fn with_exposures(mut self, exposures: Option<Exposures>) -> Self {
         let count = exposures.as_ref().map_or(self.views.count(), Exposures::count);
-        assert_eq!(count, self.views.count(), "exposures of other views");
+        assert_eq!(count, self.views.count(), "the numbers of exposures and of views differ");
         self.state.exposures = exposures;
         self
     }
@@ -138,7 +139,7 @@ impl<V: ViewSource> Trainer<V> {
         let step = self.state.step + 1;
         let view = self.next_view();
         let start = Instant::now();
-        // If the image cannot be read, the state is still that of the last checkpoint.
+        // The image is read first, so that an error leaves the state after the last step unchanged.
         let image = self.image(step, view)?;
         if (self.state.step as usize).is_multiple_of(self.views.count()) {
             self.backend.begin_epoch();
@@ -188,8 +189,8 @@ impl<V: ViewSource> Trainer<V> {
 
     /// A random sample of `count` scored views that depends on seed and step; all of them if there are fewer.
     fn sample_scored_views(&self, count: usize, step: u32) -> Vec<usize> {
-        let drawn = schedule::fresh_views(self.scored.len(), count, self.options.seed, step);
-        drawn.into_iter().map(|place| self.scored[place]).collect()
+        let drawn = schedule::fresh_views(self.scored_views.len(), count, self.options.seed, step);
+        drawn.into_iter().map(|i| self.scored_views[i]).collect()
     }
 
     fn image(&self, step: u32, view: usize) -> Result<SharedImage, TrainError> {
@@ -222,7 +223,7 @@ impl<V: ViewSource> Trainer<V> {
         Ok((terms, noise))
     }
 
-    /// Asks the policy a question that can fail only by a panic.
+    /// Calls a method of the policy that can fail only by panicking.
     fn ask_policy<T>(
         &self,
         step: u32,
@@ -245,13 +246,13 @@ impl<V: ViewSource> Trainer<V> {
             self.next_order = schedule::view_order(count, self.options.seed, epoch + 1);
         }
         // Beyond the last iteration the number of remaining steps is unknown.
-        let left = self.options.iterations.checked_sub(self.state.step + 1);
-        let last = left.map_or(usize::MAX, |left| left as usize);
+        let remaining = self.options.iterations.checked_sub(self.state.step + 1);
+        let remaining = remaining.map_or(usize::MAX, |steps| steps as usize);
         let upcoming: Vec<usize> = self.order[place + 1..]
             .iter()
             .chain(&self.next_order)
             .copied()
-            .take(self.options.prefetch.min(last))
+            .take(self.options.prefetch.min(remaining))
             .collect();
         self.views.prefetch(&upcoming);
         self.order[place]

@@ -1,9 +1,9 @@
-//! Removes rows with non-finite values; many of them end the run.
+//! Removes rows with non-finite values; ends the run if there are many.
 
 use super::{AtStep, EditEvent, OnNan, TrainError, Trainer};
 use densify_data::views::ViewSource;
 
-/// Number of steps between audits, in addition to those before the policy's edits.
+/// Number of steps between regular audits. The rows are also audited before each edit of the policy.
 pub(super) const AUDIT_EVERY: u32 = 100;
 /// Largest share of the rows that an audit may remove. Removing so few has a negligible effect; more non-finite rows
 /// mean that the run diverges. A single row may always be removed.
@@ -22,11 +22,11 @@ impl<V: ViewSource> Trainer<V> {
         for row in unsound.iter().take(MAX_NAMED) {
             tracing::warn!(step, row = row.row, "non-finite value: {row}");
         }
-        let few = count as f64 <= (MAX_SHARE * rows as f64).max(1.0) && count < rows;
+        let is_small = count as f64 <= (MAX_SHARE * rows as f64).max(1.0) && count < rows;
         let budget = self.row_budget();
         let trained: Option<Vec<u32>> =
             unsound.iter().map(|row| budget.trained_row(row.row)).collect();
-        match trained.filter(|_| few && self.options.on_nan == OnNan::Prune) {
+        match trained.filter(|_| is_small && self.options.on_nan == OnNan::Prune) {
             Some(trained) => {
                 let mut plan = self.new_plan();
                 plan.cause("not finite");

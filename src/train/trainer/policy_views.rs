@@ -40,8 +40,8 @@ impl<V: ViewSource> Trainer<V> {
             self.state.extra_forwards += 1;
             let (loss, columns, points) = (measured.loss, &measured.columns, &measured.points);
             let view = AuxView { step, rows, loss, columns, points };
-            let seen = call_policy(|| self.policy.observe(&view)).and_then(|done| done);
-            seen.map_err(|source| self.policy_error(step, source))?;
+            let observed = call_policy(|| self.policy.observe(&view)).flatten();
+            observed.map_err(|source| self.policy_error(step, source))?;
         }
         Ok(())
     }

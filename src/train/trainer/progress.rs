@@ -18,7 +18,7 @@ impl<V: ViewSource> Trainer<V> {
     /// Number of training views that are not rendered for the policy's scores because they are near-duplicates; 0 if
     /// the policy renders no views.
     pub fn unscored_views(&self) -> usize {
-        if self.needs.aux.is_some() { self.views.count() - self.scored.len() } else { 0 }
+        if self.needs.aux.is_some() { self.views.count() - self.scored_views.len() } else { 0 }
     }
 
     /// Number of steps done.
@@ -31,7 +31,7 @@ impl<V: ViewSource> Trainer<V> {
         self.backend.rows()
     }
 
-    /// Wall time that steps have waited for images so far.
+    /// Wall time that steps have spent waiting for images so far.
     pub fn images_time(&self) -> Duration {
         self.images_time
     }
@@ -65,8 +65,8 @@ impl<V: ViewSource> Trainer<V> {
         let edited = |(row, &age): (usize, &f32)| {
             if budget.is_frozen(row) { 0 } else { step.saturating_sub(age as u32) }
         };
-        let known = ages.get(Signal::Age).unwrap_or_default().iter().enumerate();
-        let edited: Vec<u32> = known.map(edited).collect();
+        let rows = ages.get(Signal::Age).unwrap_or_default().iter().enumerate();
+        let edited: Vec<u32> = rows.map(edited).collect();
         self.history = Some(RowHistory::from_edits(&edited, self.backend.budget()));
         self.backend.give_back(ages);
         Ok(())

@@ -10,7 +10,7 @@ use densify_render::StepOutput;
 pub struct StepReport {
     /// Iteration, 1-based.
     pub step: u32,
-    /// Index of the view.
+    /// Index of the training view.
     pub view: usize,
     /// Loss and other scalars of the step.
     pub output: StepOutput,

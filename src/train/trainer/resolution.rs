@@ -1,4 +1,4 @@
-//! Training with smaller images on request of the policy.
+//! Training with smaller images at the policy's request.
 //!
 //! *EAGLES* (Girish et al. 2024) starts with small images and increases their size during the run. The camera of a view
 //! is scaled with its image, so that the model stays in the same coordinates.
@@ -12,7 +12,7 @@ use densify_core::camera::Camera;
 use densify_core::image::SharedImage;
 use densify_data::views::ViewSource;
 
-/// Smallest side of shrunk images `[px]`, because nothing could be learned from smaller ones.
+/// Smallest side of shrunk images `[px]`, because nothing could be learned from smaller images.
 const MIN_SIDE: u32 = 16;
 
 impl<V: ViewSource> Trainer<V> {
@@ -23,11 +23,11 @@ impl<V: ViewSource> Trainer<V> {
         view: usize,
         image: SharedImage,
     ) -> Result<(Camera, SharedImage), TrainError> {
-        let share = self.ask_policy(step, |policy| policy.resolution(step))?;
-        let checked = self.needs.check_resolution(share).map_err(PolicyError::Other);
+        let scale = self.ask_policy(step, |policy| policy.resolution(step))?;
+        let checked = self.needs.check_resolution(scale).map_err(PolicyError::Other);
         checked.map_err(|error| self.policy_error(step, error))?;
         let camera = *self.views.camera(view);
-        let (width, height) = shrunk((camera.width, camera.height), share);
+        let (width, height) = shrunk((camera.width, camera.height), scale);
         if (width, height) == (camera.width, camera.height) {
             return Ok((camera, image));
         }
@@ -35,12 +35,12 @@ impl<V: ViewSource> Trainer<V> {
     }
 }
 
-/// Both sides times `share`, rounded down, but not below [`MIN_SIDE`].
-fn shrunk((width, height): (u32, u32), share: f64) -> (u32, u32) {
+/// Both sides times `scale`, rounded down. The scale is raised if the shorter side would be less than [`MIN_SIDE`].
+fn shrunk((width, height): (u32, u32), scale: f64) -> (u32, u32) {
     let least = f64::from(MIN_SIDE) / f64::from(width.min(height));
-    let share = share.max(least).min(1.0);
-    // The small addend compensates rounding of products that should be integers.
-    let side = |side: u32| ((f64::from(side) * share + 1e-6) as u32).max(1);
+    let scale = scale.max(least).min(1.0);
+    // The small addend compensates for the rounding of products that should be integers.
+    let side = |side: u32| ((f64::from(side) * scale + 1e-6) as u32).max(1);
     (side(width), side(height))
 }
 

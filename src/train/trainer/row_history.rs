@@ -14,7 +14,8 @@ impl RowHistory {
     /// Memory per row of the budget `[bytes]`.
     pub const BYTES: u64 = 2 * size_of::<u32>() as u64;
 
-    /// The history of rows whose creation is unknown and assumed to be their last edit. It has room for `budget` rows.
+    /// A history with room for `budget` rows, in which each row counts as created in the step of its last edit, because
+    /// the step of its creation is unknown.
     pub fn from_edits(edited: &[u32], budget: usize) -> Self {
         let with_room = || {
             let mut steps = Vec::with_capacity(budget);
@@ -29,7 +30,7 @@ impl RowHistory {
         &self.created
     }
 
-    /// The step in which each row was created, rewritten or updated last. Changes of all rows at once do not count.
+    /// The step in which each row was last created, rewritten or updated. Changes of all rows at once do not count.
     /// Shape: `[rows]`.
     pub fn edited(&self) -> &[u32] {
         &self.edited

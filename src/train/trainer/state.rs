@@ -19,7 +19,7 @@ use densify_data::views::ViewSource;
 pub struct TrainerState {
     /// Number of steps done.
     pub step: u32,
-    /// Number of rows after initialisation, besides frozen ones.
+    /// Number of rows after initialisation, without frozen rows.
     pub initial_rows: usize,
     /// Largest number of rows so far, including those during edits.
     pub peak_rows: usize,
@@ -54,15 +54,15 @@ impl<V: ViewSource> Trainer<V> {
     /// have the model and the backend state of the same step.
     ///
     /// # Errors
-    /// [`PolicyError`] if the policy rejects its state, or if the exposures do not match; then the trainer must not be
-    /// used.
+    /// [`PolicyError`] if the policy rejects its state, or if the exposures do not match. After an error the trainer
+    /// must not be used.
     pub fn resume(&mut self, mut state: TrainerState) -> Result<(), PolicyError> {
         let policy = std::mem::take(&mut state.policy);
-        call_policy(|| self.policy.restore(policy)).and_then(|done| done)?;
+        call_policy(|| self.policy.restore(policy)).flatten()?;
         let matches = match (&state.exposures, &self.state.exposures) {
             (Some(saved), Some(own)) => saved.check_matches(own),
             (None, None) => Ok(()),
-            _ => Err("only one of the checkpoint and this run has exposures".to_owned()),
+            _ => Err("either the checkpoint or this run has exposures, but not both".to_owned()),
         };
         matches.map_err(PolicyError::Other)?;
         self.scene.initial_rows = state.initial_rows;

@@ -34,8 +34,8 @@ pub(super) fn check_options(
     let frozen = options.frozen;
     let expected = RowBudget::for_trainable(scene.budget, frozen).total;
     if budget != expected || rows > budget || rows < frozen {
-        let of_scene = scene.budget;
-        return bad(format!("{rows} rows, {frozen} frozen, budget {budget} (scene: {of_scene})"));
+        let own = scene.budget;
+        return bad(format!("{rows} rows ({frozen} frozen), budget {budget} (scene's: {own})"));
     }
     Ok(())
 }

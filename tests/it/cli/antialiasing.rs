@@ -71,9 +71,9 @@ fn antialiasing_is_carried_through_every_command() {
         let mean = outcome.stdout.lines().find(|line| line.starts_with("mean"));
         mean.expect("a mean").to_owned()
     };
-    let own = score("");
+    let default_score = score("");
     let results = read_text(&run.join("results.json"));
-    assert_ne!(own, score("--antialias=none"));
+    assert_ne!(default_score, score("--antialias=none"));
     assert_eq!(
         read_text(&run.join("results.json")),
         results,

@@ -102,11 +102,11 @@ fn the_automatic_degree_is_the_same_for_a_built_in_scene_and_its_files() {
 #[test]
 fn nothing_is_left_out_by_default() {
     let scene = Photographs::colmap_text();
-    for (flags, said) in [("", "left out nothing\n"), ("--full", "left out nothing (--full)\n")] {
+    for (flags, note) in [("", "left out nothing\n"), ("--full", "left out nothing (--full)\n")] {
         let (_root, run) = scratch();
         let (scene, output) = (text(scene.path()), text(&run));
         let outcome = call(&format!("train {scene} -o {output} --iterations 5 {flags}")).ok();
-        assert!(outcome.stdout.contains(said), "{}", outcome.stdout);
+        assert!(outcome.stdout.contains(note), "{}", outcome.stdout);
         assert_eq!(report(&run)["left_out"], serde_json::json!([]));
         assert_eq!(report(&run)["sh_degree"], 3);
     }

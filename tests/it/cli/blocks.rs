@@ -197,7 +197,7 @@ fn impossible_plans_are_refused_and_write_nothing() {
     let left: Vec<_> = std::fs::read_dir(root.path()).unwrap().collect();
     assert!(left.is_empty(), "{left:?}");
 
-    // `plan` chooses enough blocks to fit each into the memory, together with the Gaussians of the coarse model.
+    // `plan` chooses enough blocks for each to fit into the memory together with the Gaussians of the coarse model.
     let most = 96 << 20;
     let bounded = read_plan(
         scene.path(),

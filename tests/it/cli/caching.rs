@@ -17,8 +17,8 @@ fn train(cache: &Path, run: &Path, flags: &[&str]) -> Vec<u8> {
 }
 
 fn entries(cache: &Path) -> Vec<PathBuf> {
-    let found = std::fs::read_dir(cache.join("densify/scenes")).into_iter().flatten();
-    found.map(|entry| entry.expect("an entry").path()).collect()
+    let entries = std::fs::read_dir(cache.join("densify/scenes")).into_iter().flatten();
+    entries.map(|entry| entry.expect("an entry").path()).collect()
 }
 
 #[test]

@@ -168,11 +168,11 @@ fn invalid_comparisons_are_refused_before_any_run() {
 
 /// Name, model and PSNR of every run, in an order that does not depend on the engine.
 fn results(folder: &Path) -> Vec<Value> {
-    let found = records(&folder.join("compare.jsonl"));
-    let mut found: Vec<Value> =
-        found.iter().map(|r| json!([r["run"], r["model"], r["psnr"]])).collect();
-    found.sort_by_key(ToString::to_string);
-    found
+    let records = records(&folder.join("compare.jsonl"));
+    let mut results: Vec<Value> =
+        records.iter().map(|r| json!([r["run"], r["model"], r["psnr"]])).collect();
+    results.sort_by_key(ToString::to_string);
+    results
 }
 
 /// The first call submits the runs to a scheduler; repeating it collects the results. `sbatch` is a stand-in that does

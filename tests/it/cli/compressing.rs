@@ -21,7 +21,7 @@ fn compressed_files_stay_within_the_requested_size() {
         );
         (call(&words), output)
     };
-    // Half of the bytes in the same format, by fewer Gaussians or a lower SH degree.
+    // Half of the bytes in the same format are reached by fewer Gaussians or a lower SH degree.
     let (outcome, ply) = compress(&format!("{}B", whole / 2), "half.ply", "");
     let outcome = outcome.ok();
     let size = read(&ply).len();
@@ -43,7 +43,7 @@ fn compressed_files_stay_within_the_requested_size() {
     assert!(!outcome.ok().stdout.contains("training"));
     assert_eq!(read(&same).len(), whole);
 
-    // `any` picks a format in which the whole model fits half the bytes of the PLY, so nothing is trained.
+    // `any` picks a format in which the whole model takes at most half the bytes of the PLY, so nothing is trained.
     let (outcome, any) = compress(&format!("{}B", whole / 2), "any", "--format any");
     let outcome = outcome.ok();
     let found: Vec<_> =

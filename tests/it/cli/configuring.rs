@@ -35,11 +35,11 @@ fn flags_override_the_configuration_file() {
     );
     // The `config.toml` that a run writes reproduces the run.
     let config = by_flags.join("config.toml");
-    for what in [format!("--config {file} --seed 5"), format!("--config {}", text(&config))] {
+    for flags in [format!("--config {file} --seed 5"), format!("--config {}", text(&config))] {
         let again = root.path().join("again");
-        train(&format!("{what} --overwrite"), &again);
-        assert!(model(&by_flags, ITERATIONS) == model(&again, ITERATIONS), "{what}");
-        assert!(read(&config) == read(&again.join("config.toml")), "{what}");
+        train(&format!("{flags} --overwrite"), &again);
+        assert!(model(&by_flags, ITERATIONS) == model(&again, ITERATIONS), "{flags}");
+        assert!(read(&config) == read(&again.join("config.toml")), "{flags}");
     }
     // The library reproduces it, too.
     let library = root.path().join("library");

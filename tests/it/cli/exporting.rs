@@ -95,7 +95,8 @@ fn every_format_is_written_compared_and_read_back() {
     let names: Vec<_> = files(&others).into_keys().collect();
     let expected = ["glb", "ply", "sog"].map(|extension| format!("re.mote.{extension}"));
     assert!(expected.iter().all(|name| names.contains(name)), "{names:?}");
-    // SPZ has no room for the position. In the compressed PLY, the others of its chunk would collapse to a plane.
+    // SPZ cannot represent the position. In the compressed PLY, the other Gaussians of its chunk would collapse to a
+    // plane.
     let unfit = |name: &String| name.ends_with("spz") || name.contains("compressed");
     assert!(!names.iter().any(unfit), "{names:?}");
     let refused =

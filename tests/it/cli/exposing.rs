@@ -186,8 +186,8 @@ fn auto_detects_differing_exposures_before_training() {
         assert_eq!(factors.is_object(), jitter == "1", "{factors}");
         let flags = "--exposure auto --eval --backend cpu --budget 2k";
         let outcome = train(&folder, &run, 3, flags).ok();
-        let stdout = format!("exposure {word} (auto): judged by the colours of");
-        assert!(outcome.stdout.contains(&stdout), "{}", outcome.stdout);
+        let decision = format!("exposure {word} (auto): judged by the colours of");
+        assert!(outcome.stdout.contains(&decision), "{}", outcome.stdout);
         let report = json(&run.join("stats/requirements.json"));
         assert_eq!(report["exposures"], word == "on", "{report}");
         let left_out = report["left_out"].to_string().contains("exposure for each photograph");

@@ -162,15 +162,15 @@ fn render_writes_images_of_the_views() {
     assert_eq!(files(&train).len(), VIEWS - 2);
 }
 
-/// A run brings its near plane, so nobody is told to give another when it is only measured.
+/// A run brings its own near plane, so a command that only measures it does not tell the user to give another.
 #[test]
 fn the_near_plane_of_a_run_is_announced_only_when_it_trains() {
     let scene = Photographs::colmap_text();
     let (_root, run) = scratch();
-    let said = train(scene.path(), &run, 2, "--budget 320 --eval --near 0.999").ok();
-    assert!(said.stdout.contains("nearer than --near 0.999"), "{said:?}");
-    let said = call(&format!("eval {} --backend cpu", text(&run))).ok();
-    assert!(!said.stdout.contains("--near"), "{said:?}");
+    let outcome = train(scene.path(), &run, 2, "--budget 320 --eval --near 0.999").ok();
+    assert!(outcome.stdout.contains("nearer than --near 0.999"), "{outcome:?}");
+    let outcome = call(&format!("eval {} --backend cpu", text(&run))).ok();
+    assert!(!outcome.stdout.contains("--near"), "{outcome:?}");
 }
 
 #[test]

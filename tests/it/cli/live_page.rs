@@ -149,8 +149,8 @@ fn viewers_do_not_change_a_byte_of_the_run() {
         // Viewing stayed within the promised memory.
         let summary = json(&viewed.join("stats/summary.json"));
         let lines = summary["ledger"]["lines"].as_array().expect("lines");
-        for what in ["the page", "a picture for the page"] {
-            assert!(lines.iter().any(|line| line["what"] == what), "{what} is not in the ledger");
+        for name in ["the page", "a picture for the page"] {
+            assert!(lines.iter().any(|line| line["what"] == name), "{name} is not in the ledger");
         }
         if let Some(peak) = summary["peak_bytes"].as_u64() {
             assert!(peak <= count(&summary, "ledger_bytes"), "{policy}: {summary}");

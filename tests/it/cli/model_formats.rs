@@ -54,7 +54,7 @@ fn every_command_accepts_models_of_any_format() {
     let scene = Photographs::colmap_text();
     let (root, run) = scratch();
     train(scene.path(), &run, 60, "--budget 320 --eval --quiet").ok();
-    let own = json(&run.join("results.json"))["ours_60"]["PSNR"].as_f64().unwrap();
+    let psnr = json(&run.join("results.json"))["ours_60"]["PSNR"].as_f64().unwrap();
     let whole = gaussians(&model_path(&run, 60));
     let at = |name: &str| root.path().join(name);
     // File names without extensions, so that only the content identifies the format.
@@ -76,7 +76,7 @@ fn every_command_accepts_models_of_any_format() {
         // `.splat` loses view-dependent colour. The other formats differ from the model by 42 dB, less than the model
         // differs from the photographs.
         let tolerance = if *format == ".splat" { 3.0 } else { 0.1 };
-        assert!((mean(&stdout) - own).abs() < tolerance, "{format}: {} of {own}", mean(&stdout));
+        assert!((mean(&stdout) - psnr).abs() < tolerance, "{format}: {} of {psnr}", mean(&stdout));
 
         let pictures = at("pictures");
         let render =
@@ -97,8 +97,8 @@ fn every_command_accepts_models_of_any_format() {
         assert!(count(&summary, "peak_rows") >= whole.len() as u64, "{format}: {summary}");
         let after = json(&from.join("results.json"))["ours_1"]["PSNR"].as_f64().unwrap();
         assert!(
-            (after - own).abs() < tolerance + 1.0,
-            "{format}: {after} after a step, {own} before"
+            (after - psnr).abs() < tolerance + 1.0,
+            "{format}: {after} after a step, {psnr} before"
         );
         std::fs::remove_dir_all(&from).unwrap();
     }

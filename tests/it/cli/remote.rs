@@ -12,7 +12,7 @@ use glam::DVec3;
 use super::{call, gaussians, json, read, scratch, text, train, write_ply};
 use crate::photographs::Photographs;
 
-/// Easting, northing and height `[m]`. At this northing, f32 resolves half a metre; Gaussians measure 0.1 to 0.4.
+/// Easting, northing and height `[m]`. At this northing, f32 resolves 0.5 m; Gaussians measure 0.1 m to 0.4 m.
 const UTM: DVec3 = DVec3::new(512_345.25, 5_400_123.25, 81.0);
 const ITERATIONS: u32 = 60;
 
@@ -52,19 +52,19 @@ fn a_remote_model_keeps_its_quality_or_a_note_says_otherwise() {
         let outcome = train(scene.path(), &folder, ITERATIONS, &flags).ok();
         (model_path(&folder, ITERATIONS), psnr(&folder, ITERATIONS), outcome.stdout)
     };
-    let (file, near, said) = run("near", &scene, "");
-    assert!(!said.contains("coords") && !said.contains("so far from the origin"), "{said}");
+    let (file, near, stdout) = run("near", &scene, "");
+    assert!(!stdout.contains("coords") && !stdout.contains("so far from the origin"), "{stdout}");
     assert!(!head(&file).contains("comment"));
     let mut files = Vec::new();
     for (name, flags) in
         [("auto", ""), ("local", "--coordinates local"), ("double", "--coordinates double")]
     {
-        let (file, found, said) = run(name, &far, flags);
+        let (file, found, stdout) = run(name, &far, flags);
         assert!((found - near).abs() < 0.05, "{name}: {found} of {near}");
         let saved = evaluated(&file, &far);
         assert!((saved - near).abs() < 0.05, "{name}: {saved} of {near}");
-        let is_noted = said.contains("coords   local") && said.contains("note: saved in local");
-        assert_eq!(is_noted, name == "auto", "{name}: {said}");
+        let is_noted = stdout.contains("coords   local") && stdout.contains("note: saved in local");
+        assert_eq!(is_noted, name == "auto", "{name}: {stdout}");
         files.push(file);
     }
     let [automatic, local, double] = &files[..] else { panic!("three") };
@@ -78,11 +78,11 @@ fn a_remote_model_keeps_its_quality_or_a_note_says_otherwise() {
 
     // World coordinates lose quality: a note says so before training, and scores show it. Training itself is the same.
     let flags = "--coordinates world --test-iterations 30";
-    let (file, found, said) = run("world", &far, flags);
+    let (file, found, stdout) = run("world", &far, flags);
     assert!(found < near - 1.0, "{found} of {near}");
     let saved = evaluated(&file, &far);
     assert!((saved - found).abs() < 0.05, "{saved} of {found}");
-    assert!(said.contains("will be worse") && said.contains("--coordinates local"), "{said}");
+    assert!(stdout.contains("will be worse") && stdout.contains("--coordinates local"), "{stdout}");
     let [world, local] = ["world", "local"].map(|name| root.path().join(name));
     assert!(means_in_checkpoint(&world) == means_in_checkpoint(&local));
     let plan =
@@ -103,11 +103,11 @@ fn every_command_reads_local_models(run: &Path, far: &Photographs, near: f64) {
     };
     for format in ["ply", "glb", "compressed-ply", "spz", "spz-v4", "sog"] {
         let file = at(&format!("model.{}", find(format).unwrap().extension));
-        let said = export(run, &file, "").ok().stdout;
-        assert!(said.contains("saved in local coordinates"), "{format}: {said}");
+        let stdout = export(run, &file, "").ok().stdout;
+        assert!(stdout.contains("saved in local coordinates"), "{format}: {stdout}");
         let needs_sidecar = ["spz", "spz-v4"].contains(&format);
         assert_eq!(sidecar_path(&file).is_file(), needs_sidecar);
-        assert_eq!(said.contains("keep both files together"), needs_sidecar, "{said}");
+        assert_eq!(stdout.contains("keep both files together"), needs_sidecar, "{stdout}");
         let found = evaluated(&file, far);
         assert!((found - near).abs() < 0.1, "{format}: {found} of {near}");
         // World coordinates would not hold the model.
@@ -153,8 +153,9 @@ fn every_command_reads_local_models(run: &Path, far: &Photographs, near: f64) {
     // A model near the origin stays as it is.
     let usual = densify::core::gaussians::Gaussians { origin: [0.0; 3], ..whole };
     write_ply(&usual, &at("usual.ply"));
-    let said = export(&at("usual.ply"), &at("same.ply"), "").ok().stdout;
-    assert!(read(&at("usual.ply")) == read(&at("same.ply")) && !said.contains("so far"), "{said}");
+    let stdout = export(&at("usual.ply"), &at("same.ply"), "").ok().stdout;
+    assert!(read(&at("usual.ply")) == read(&at("same.ply")));
+    assert!(!stdout.contains("so far"), "{stdout}");
 }
 
 /// A sidecar whose model was replaced is refused by every command.

@@ -108,7 +108,7 @@ fn a_report_shows_the_results_and_is_self_contained() {
         "worst".into(),
         "best".into(),
         "the promise was kept".into(),
-        "Nothing".into(),
+        "<p>None</p>".into(),
         "sh_degree".into(),
         "min_opacity".into(),
     ];
@@ -252,7 +252,7 @@ fn reports_average_seeds_compare_policies_and_separate_scenes() {
     let page = read_text(&file);
     assert_self_contained(&page);
     for words in
-        ["3 runs of 3 scenes", "Views of garden<", "Views of garden, other reading options (2)<"]
+        ["3 runs of 3 scenes", "Views of garden<", "Views of garden, read with other options (2)<"]
     {
         assert!(page.contains(words), "{words} is not in the report");
     }
@@ -277,7 +277,7 @@ fn runs_without_test_views_show_training_views() {
     let page = read_text(&file);
     assert_self_contained(&page);
     for words in
-        ["No view was held out", &format!("{VIEWS} views trained on"), "second worst", "--eval"]
+        ["No view was held out", &format!("{VIEWS} training views"), "second worst", "--eval"]
     {
         assert!(page.contains(words), "{words} is not in the report");
     }

@@ -138,8 +138,8 @@ fn every_policy_resumes_exactly_on_a_gpu() {
         );
         let [found, expected] = [whole, run].map(|run| quality(&run));
         let message = format!("{policy} on {name}: {found:?}, natively {expected:?}");
-        // From then on, a difference in the last bit can change which Gaussian is replaced, as another seed would: seeds
-        // lie up to 1 dB apart. `mini-splatting` resamples all Gaussians by weight.
+        // From then on, a difference in the last bit can change which Gaussian is replaced, as another seed would.
+        // Seeds differ by up to 1 dB. `mini-splatting` resamples all Gaussians by weight.
         let tolerance = if policy == "mini-splatting" { 2.0 } else { 1.0 };
         assert!((found.0 - expected.0).abs() < tolerance, "{message}");
         assert!(found.1.abs_diff(expected.1) * 50 <= expected.1, "{message}");

@@ -93,7 +93,7 @@ fn check_loss(run: &Path, policy: &str, least_psnr: f64) {
     // `vanilla` resets opacities midway and has little time to recover. `eagles` starts with small images, whose
     // loss is low.
     let is_comparable = policy != "eagles";
-    assert!(!is_comparable || last < 0.9 * first, "{policy}: the loss went {loss:?}");
+    assert!(!is_comparable || last < 0.9 * first, "{policy}: the loss was {loss:?}");
     assert!(log.iter().all(|record| count(record, "rows") <= BUDGET));
     let scores = json(&run.join("results.json"));
     let psnr = number(&scores[format!("ours_{ITERATIONS}")], "PSNR");

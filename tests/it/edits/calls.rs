@@ -66,6 +66,7 @@ fn offspring() -> impl Strategy<Value = Offspring> {
     )
 }
 
+/// Any operation of an edit.
 pub(super) fn call() -> impl Strategy<Value = Call> {
     // Some rows are out of range for any number of rows.
     let row = || 0..ROWS as u32 + 12;
@@ -86,9 +87,9 @@ pub(super) fn call() -> impl Strategy<Value = Call> {
     let update = prop_oneof![3 => update, 1 => restart];
     let decay = (0.0_f32..0.3, 0.0_f32..0.3, any::<bool>());
     let decay = decay.prop_map(|(opacity, scale, seen_only)| Decay { opacity, scale, seen_only });
-    let some = prop::sample::subsequence(SIGNALS.to_vec(), 0..=SIGNALS.len());
-    let some = some.prop_map(|signals| Some(signals.into_iter().collect()));
-    let reset = prop_oneof![Just(None), some].prop_map(Call::Reset);
+    let some_signals = prop::sample::subsequence(SIGNALS.to_vec(), 0..=SIGNALS.len());
+    let some_signals = some_signals.prop_map(|signals| Some(signals.into_iter().collect()));
+    let reset = prop_oneof![Just(None), some_signals].prop_map(Call::Reset);
     let unit = || prop::array::uniform3(0.0_f32..1.0);
     let scales = prop::array::uniform3(0.01_f32..0.3);
     let seed = (unit(), unit(), scales, quaternion(), 0.01_f32..0.99).prop_map(

@@ -105,10 +105,10 @@ fn confined(logit: f32) -> f32 {
 }
 
 /// Checks that values agree up to the rounding of a few operations.
-fn assert_close(what: &str, row: usize, found: &[f32], expected: &[f32]) {
+fn assert_close(quantity: &str, row: usize, found: &[f32], expected: &[f32]) {
     let close = |(a, b): (&f32, &f32)| (a - b).abs() <= 2e-6 * (1.0 + a.abs().max(b.abs()));
     let agree = found.len() == expected.len() && found.iter().zip(expected).all(close);
-    assert!(agree, "{what} of row {row}: {found:?}, expected {expected:?}");
+    assert!(agree, "{quantity} of row {row}: {found:?}, expected {expected:?}");
 }
 
 fn check_rows(found: &[Row], expected: &[Row]) {
@@ -120,8 +120,8 @@ fn check_rows(found: &[Row], expected: &[Row]) {
         assert_close("log-scale", i, &found.log_scale, &expected.log_scale);
         // A decayed opacity has the same relative accuracy as before.
         let opacity = |row: &Row| 1.0 / (1.0 + (-f64::from(row.logit)).exp());
-        let off = (opacity(found) - opacity(expected)).abs();
-        if !expected.has_decayed || off > 2e-7 {
+        let error = (opacity(found) - opacity(expected)).abs();
+        if !expected.has_decayed || error > 2e-7 {
             assert_close("logit", i, &[found.logit], &[expected.logit]);
         }
         assert_close("sh", i, &found.sh, &expected.sh);
@@ -146,12 +146,12 @@ fn check_movement(twin: &[Vec<Row>; 2], before: &[Row], after: &[Row], expected:
         assert_eq!(to.quat, is.quat, "row {i}, twin row {same}");
         let moved = |x: f32, was: f32, is: f32| x + (is - was);
         // Exact, except for rows that an update has moved.
-        let follows = |what, from: &[f32], to: &[f32], was: &[f32], is: &[f32]| {
+        let follows = |quantity, from: &[f32], to: &[f32], was: &[f32], is: &[f32]| {
             let same = from == was;
             let moves =
                 from.iter().zip(was.iter().zip(is)).map(|(x, (was, is))| moved(*x, *was, *is));
-            assert_close(what, i, to, &moves.collect::<Vec<_>>());
-            assert!(!same || to == is, "{what} of row {i}");
+            assert_close(quantity, i, to, &moves.collect::<Vec<_>>());
+            assert!(!same || to == is, "{quantity} of row {i}");
         };
         follows("mean", &from.mean, &to.mean, &was.mean, &is.mean);
         let moving = expected.sh_rests_from.min(from.sh.len());

@@ -5,7 +5,7 @@ use densify::render::{Backend, Setup};
 use densify::selftest::scenes;
 use densify_policies::policy::{AuxColumn, AuxRequest, ErrorScore, MaskTerm, Needs, Signal};
 
-use crate::subject::{GREY, devices_by_accumulation};
+use crate::subject::{BLUE, devices_by_accumulation};
 
 #[test]
 fn device_allocations_match_the_ledger() {
@@ -16,7 +16,7 @@ fn device_allocations_match_the_ledger() {
     let mask = MaskTerm { start: 1.0, rate: 0.01, weight: 5e-4, threshold: 0.01 };
     let columns = vec![AuxColumn::PixelCount, AuxColumn::MapSum];
     // The numbers per gradient record: nine, one more for the error, and another for the weight of scores.
-    let asked = [
+    let cases = [
         (needs(&[]), 9),
         (needs(&[Signal::WeightedError]), 10),
         (needs(&[Signal::Position, Signal::Colour]), 9),
@@ -38,7 +38,7 @@ fn device_allocations_match_the_ledger() {
         ),
     ];
     for (device, (needs, numbers)) in
-        devices_by_accumulation().flat_map(|device| asked.iter().map(move |asked| (device, asked)))
+        devices_by_accumulation().flat_map(|device| cases.iter().map(move |case| (device, case)))
     {
         let camera = scenes::camera(40, 30, 32);
         let model = scenes::cloud(20, 3, &camera, 42);
@@ -54,7 +54,7 @@ fn device_allocations_match_the_ledger() {
         let has_host_parts = needs.aux.is_some() || needs.error_score.edge > 0.0;
         assert_eq!(gpu.ledger().on_host() > 0, has_host_parts, "{needs:?}");
         assert_eq!(&device.memory_plan(model.sh_degree, &options), gpu.ledger());
-        gpu.render(&camera, GREY, 1).expect("a rendering");
+        gpu.render(&camera, BLUE, 1).expect("a rendering");
         assert_eq!(gpu.allocated_bytes(), promised);
         // Only accumulation in slots needs records.
         let record_lines = gpu.ledger().lines.iter().filter(|line| line.what.contains("per entry"));

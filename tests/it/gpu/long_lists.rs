@@ -7,7 +7,7 @@ use densify::render::gpu::GpuDevice;
 use densify::render::{Accumulation, ImageGradient, Shortcuts};
 use densify::run::failure::Failure;
 
-use crate::subject::{GREY, class, devices_by_accumulation, make_with};
+use crate::subject::{BLUE, class, devices_by_accumulation, make_with};
 use densify::selftest::compare::{Table, relative_error};
 use densify::selftest::{Differentiable, Setup, Subject, scenes};
 
@@ -58,9 +58,9 @@ fn ended_early<T>(result: &Result<T, Failure>, device: &GpuDevice, suggests_slot
 fn a_list_too_long_to_render_is_an_error() {
     let camera = scenes::camera(16, 16, 71);
     let model = pile(300_000, &camera);
-    let expected = faint(&Subject::NATIVE, &model).render(&camera, GREY, 0).expect("a small image");
+    let expected = faint(&Subject::NATIVE, &model).render(&camera, BLUE, 0).expect("a small image");
     for device in devices_by_accumulation() {
-        let found = backend(&model, device).render(&camera, GREY, 0).map_err(Failure::from);
+        let found = backend(&model, device).render(&camera, BLUE, 0).map_err(Failure::from);
         let suggests_slots = device.accumulation() != Accumulation::Slots;
         if !ended_early(&found, device, suggests_slots) {
             let mut table = Table::new(&format!("300,000 rows in a tile, {}", name(device)));
@@ -82,10 +82,10 @@ fn a_list_too_long_to_differentiate_is_an_error() {
         depth: vec![-0.25; 256],
     };
     let (_, expected) = faint(&Subject::NATIVE, &model)
-        .differentiate(&camera, GREY, 0, &upstream)
+        .differentiate(&camera, BLUE, 0, &upstream)
         .expect("a small image");
     for device in devices_by_accumulation() {
-        let found = backend(&model, device).differentiate(&camera, GREY, 0, &upstream);
+        let found = backend(&model, device).differentiate(&camera, BLUE, 0, &upstream);
         let found = found.map_err(Failure::from);
         if device.accumulation() != Accumulation::Slots && ended_early(&found, device, true) {
             continue;

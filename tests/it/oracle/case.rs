@@ -111,10 +111,10 @@ impl Case {
 
     /// The weights of a stored loss.
     pub(super) fn upstream(&self, camera: usize, part: Part) -> Upstream {
-        let take = |key: &str, of: Part| -> Vec<f64> {
+        let take = |key: &str, own_part: Part| -> Vec<f64> {
             let weights = self.split(self.array(&format!("loss_weight.{key}")), camera);
-            let on = part == of || part == Part::Full;
-            weights.iter().map(|w| if on { *w } else { 0.0 }).collect()
+            let is_included = part == own_part || part == Part::Full;
+            weights.iter().map(|w| if is_included { *w } else { 0.0 }).collect()
         };
         Upstream {
             rgb: take("rgb", Part::Colour),
@@ -127,8 +127,8 @@ impl Case {
     /// class in another loss is used, or else of any gradient.
     pub(super) fn tolerance(&self, key: &str) -> f64 {
         let class = key.rsplit('.').next().unwrap_or(key);
-        let largest = |of: &dyn Fn(&str) -> bool| {
-            let floors = self.floors.iter().filter(|(k, _)| !k.contains(':') && of(k));
+        let largest = |matches: &dyn Fn(&str) -> bool| {
+            let floors = self.floors.iter().filter(|(k, _)| !k.contains(':') && matches(k));
             floors.map(|(_, &floor)| floor).reduce(f64::max)
         };
         let floor = self.floors.get(key).copied();

@@ -19,7 +19,7 @@ use case::{Case, Part, cases};
 const EXACT: f64 = 1e-9;
 
 /// Images of one camera and gradients of part of the loss.
-struct Seen {
+struct Results {
     /// Keyed by the names of the stored arrays.
     images: [(&'static str, Vec<f64>); 3],
     /// In the order of [`CLASSES`].
@@ -37,7 +37,7 @@ fn view(case: &Case, camera: usize) -> View<'_> {
     View { camera: &case.cameras[camera], background, sh_degree: case.sh_degree }
 }
 
-fn by_reference(case: &Case, camera: usize, part: Part) -> Seen {
+fn by_reference(case: &Case, camera: usize, part: Part) -> Results {
     let upstream = case.upstream(camera, part);
     let (image, gradient) =
         differentiate(&Model::from(&case.model), view(case, camera), &Rules::STANDARD, &upstream);
@@ -45,7 +45,7 @@ fn by_reference(case: &Case, camera: usize, part: Part) -> Seen {
     let pixels = image.boundary.iter().zip(case.away_from_thresholds(camera));
     assert!(pixels.into_iter().all(|(close, away)| !(*close && away)), "{}", case.name);
     let flat = |of: fn(&ScreenGradient) -> Vec<f64>| gradient.screen.iter().flat_map(of).collect();
-    Seen {
+    Results {
         images: [("rgb", image.rgb), ("alpha", image.alpha), ("depth_acc", image.depth)],
         classes: CLASSES.map(|class| gradient.model.class(class).to_vec()).into(),
         mean2d: flat(|row| row.mean.to_vec()),
@@ -57,12 +57,12 @@ fn by_reference(case: &Case, camera: usize, part: Part) -> Seen {
     }
 }
 
-fn by_backend(subject: &Subject, case: &Case, camera: usize, part: Part) -> Seen {
+fn by_backend(subject: &Subject, case: &Case, camera: usize, part: Part) -> Results {
     let upstream = scenes::narrowed(&case.upstream(camera, part));
     let (image, gradient) = make(subject, &case.model)
         .differentiate(&case.cameras[camera], case.background, case.sh_degree, &upstream)
         .expect("a small image is rendered");
-    Seen {
+    Results {
         images: [
             ("rgb", wide(&image.rgb)),
             ("alpha", wide(&image.alpha)),
@@ -81,12 +81,12 @@ fn by_backend(subject: &Subject, case: &Case, camera: usize, part: Part) -> Seen
 /// Compares the results of all cases: images with `image_tolerance`, gradients and statistics with the `tolerance` of a
 /// case and a key.
 fn check(
-    what: &str,
-    see: impl Fn(&Case, usize, Part) -> Seen,
+    subject: &str,
+    compute: impl Fn(&Case, usize, Part) -> Results,
     image_tolerance: f64,
     tolerance: impl Fn(&Case, &str) -> f64,
 ) {
-    let mut table = Table::new(&format!("{what} against stored arrays"));
+    let mut table = Table::new(&format!("{subject} against stored arrays"));
     for case in &cases() {
         for part in Part::ALL {
             let prefix = format!("grad_{}", part.key());
@@ -97,10 +97,10 @@ fn check(
             // Stored parameter gradients are summed over cameras; screen gradients are per camera.
             let mut sums: Vec<Vec<f64>> = Vec::new();
             let cameras = 0..case.cameras.len();
-            let views: Vec<Seen> = cameras.map(|camera| see(case, camera, part)).collect();
-            for (camera, seen) in views.iter().enumerate() {
+            let views: Vec<Results> = cameras.map(|camera| compute(case, camera, part)).collect();
+            for (camera, results) in views.iter().enumerate() {
                 sums.resize(CLASSES.len(), Vec::new());
-                for (sum, class) in sums.iter_mut().zip(&seen.classes) {
+                for (sum, class) in sums.iter_mut().zip(&results.classes) {
                     sum.resize(class.len(), 0.0);
                     sum.iter_mut().zip(class).for_each(|(sum, g)| *sum += g);
                 }
@@ -109,11 +109,11 @@ fn check(
                     figure(&key, measured, case.of_camera(&key, camera));
                 };
                 if matches!(part, Part::Colour | Part::Full) {
-                    on_screen("mean2d", &seen.mean2d);
-                    on_screen("mean2d_abs", &seen.mean2d_abs);
+                    on_screen("mean2d", &results.mean2d);
+                    on_screen("mean2d_abs", &results.mean2d_abs);
                 }
                 if part == Part::Colour {
-                    on_screen("g_color", &seen.colour);
+                    on_screen("g_color", &results.colour);
                 }
             }
             for (class, sum) in CLASSES.iter().zip(&sums) {
@@ -121,10 +121,10 @@ fn check(
                 figure(&key, sum, case.expected(&key));
             }
             if part == Part::Full {
-                for (camera, seen) in views.iter().enumerate() {
-                    check_images(&mut table, case, camera, seen, image_tolerance);
+                for (camera, results) in views.iter().enumerate() {
+                    check_images(&mut table, case, camera, results, image_tolerance);
                     let tolerance = tolerance(case, "max_weight");
-                    check_statistics(&mut table, case, camera, seen, tolerance);
+                    check_statistics(&mut table, case, camera, results, tolerance);
                 }
             }
         }
@@ -133,9 +133,9 @@ fn check(
 }
 
 /// Compares images away from thresholds by absolute difference; depth relative to the deepest pixel.
-fn check_images(table: &mut Table, case: &Case, camera: usize, seen: &Seen, tolerance: f64) {
+fn check_images(table: &mut Table, case: &Case, camera: usize, results: &Results, tolerance: f64) {
     let away = case.away_from_thresholds(camera);
-    for (key, measured) in &seen.images {
+    for (key, measured) in &results.images {
         let expected = case.of_camera(key, camera);
         let channels = measured.len() / away.len();
         let scale = expected.iter().fold(1.0_f64, |most, value| most.max(value.abs()));
@@ -151,22 +151,22 @@ fn check_images(table: &mut Table, case: &Case, camera: usize, seen: &Seen, tole
 
 /// Stored statistics omit pixels near a threshold, but computed ones cannot. Each must lie between the stored value and
 /// that value plus the largest possible contribution of the omitted pixels.
-fn check_statistics(table: &mut Table, case: &Case, camera: usize, seen: &Seen, tolerance: f64) {
+fn check_statistics(table: &mut Table, case: &Case, camera: usize, results: &Results, limit: f64) {
     let splats = project(&Model::from(&case.model), view(case, camera), &Rules::STANDARD);
     let away = case.away_from_thresholds(camera);
-    let spare = leeway(&splats, &by_depth(&splats), view(case, camera), &away);
+    let leeways = leeway(&splats, &by_depth(&splats), view(case, camera), &away);
     let beyond = |value: f64, from: f64, to: f64| (from - value).max(value - to).max(0.0);
     let stored = |key: &str, row: usize| case.of_camera(key, camera)[row];
-    for (row, &(max, sum, pixels)) in spare.iter().enumerate() {
+    for (row, &(max, sum, pixels)) in leeways.iter().enumerate() {
         let least = stored("max_weight", row);
-        let off = beyond(seen.max_weight[row], least, least.max(max));
-        table.check(&case.name, "max_weight", off, tolerance);
+        let error = beyond(results.max_weight[row], least, least.max(max));
+        table.check(&case.name, "max_weight", error, limit);
         let least = stored("sum_weight", row);
-        let off = beyond(seen.sum_weight[row], least, least + sum) / least.max(1.0);
-        table.check(&case.name, "sum_weight", off, tolerance);
+        let error = beyond(results.sum_weight[row], least, least + sum) / least.max(1.0);
+        table.check(&case.name, "sum_weight", error, limit);
         let least = stored("n_pixels", row);
-        let off = beyond(seen.pixels[row], least, least + f64::from(pixels));
-        table.check(&case.name, "n_pixels", off, 0.0);
+        let error = beyond(results.pixels[row], least, least + f64::from(pixels));
+        table.check(&case.name, "n_pixels", error, 0.0);
     }
 }
 
@@ -183,8 +183,8 @@ fn every_backend_reproduces_every_stored_array() {
             Subject::Gpu(_) | Subject::Native { instructions: InstructionSet::Scalar, .. } => 2.0,
             Subject::Native { .. } => 1.0,
         };
-        let see = |case: &Case, camera, part| by_backend(&subject, case, camera, part);
+        let compute = |case: &Case, camera, part| by_backend(&subject, case, camera, part);
         let tolerance = |case: &Case, key: &str| factor * case.tolerance(key);
-        check(&subject.name(), see, subject.limits().interior, tolerance);
+        check(&subject.name(), compute, subject.limits().interior, tolerance);
     }
 }

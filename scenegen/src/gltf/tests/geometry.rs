@@ -1,4 +1,4 @@
-//! Tests of what places and deforms geometry: skins, morph targets, instances, and hidden nodes.
+//! Tests of the features that place and deform geometry: skins, morph targets, instances, and hidden nodes.
 
 use glam::{DVec3, Vec3};
 use serde_json::json;
@@ -45,7 +45,7 @@ fn skinned(weights: [f32; 2]) -> (Value, Vec<u8>) {
     let binds = append(&mut json, &mut bin, "MAT4", &binds);
     json["scenes"][0]["nodes"] = json!([0, 1]);
     json["nodes"] = json!([
-        // The transform of the mesh's own node does not count.
+        // The transform of the mesh's own node is ignored.
         { "mesh": 0, "skin": 0, "translation": [100, 100, 100] },
         { "translation": [2, 0, 0], "children": [2] },
         { "children": [3] },
@@ -59,7 +59,7 @@ fn skinned(weights: [f32; 2]) -> (Value, Vec<u8>) {
 }
 
 #[test]
-fn skins_place_vertices_at_joints_times_inverse_binds() {
+fn skins_multiply_joint_transforms_by_inverse_bind_matrices() {
     for weights in [[0.5, 0.5], [0.2, 0.2]] {
         let (json, bin) = skinned(weights);
         let model = load_bytes(&glb(&json, &bin)).expect("a skin");

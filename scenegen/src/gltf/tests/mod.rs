@@ -7,7 +7,7 @@ use serde_json::json;
 
 use super::*;
 
-/// A `.glb` of a JSON part and a binary one.
+/// A `.glb` file of a JSON part and a binary part.
 fn glb(json: &Value, bin: &[u8]) -> Vec<u8> {
     let mut text = json.to_string().into_bytes();
     text.resize(text.len().next_multiple_of(4), b' ');
@@ -71,6 +71,7 @@ fn with(pointer: &str, value: Value) -> Result<Model, Error> {
     load_bytes(&glb(&json, &bin))
 }
 
+/// The sum of the triangles' area vectors.
 fn area(model: &Model) -> DVec3 {
     let cross = |t: &[u32; 3]| {
         let [a, b, c] = t.map(|i| model.positions[i as usize]);
@@ -271,7 +272,7 @@ fn byte_order_marks_are_skipped() {
     let text = format!("\u{feff}{text}");
     assert_eq!(area(&load_bytes(text.as_bytes()).expect("a mark")), DVec3::Z);
     let mut whole = glb(&json, &bin);
-    // A GLB may have a mark before its JSON.
+    // A GLB file may have a byte-order mark before its JSON.
     whole.splice(20..20, *b"\xef\xbb\xbf ");
     let length = u32::from_le_bytes([whole[12], whole[13], whole[14], whole[15]]) + 4;
     whole[12..16].copy_from_slice(&length.to_le_bytes());

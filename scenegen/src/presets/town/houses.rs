@@ -33,6 +33,7 @@ impl Shell {
     }
 }
 
+/// A random number from `low` to `high`.
 pub(super) fn between(draws: &mut Draws, low: f64, high: f64) -> f64 {
     low + (high - low) * draws.unit64()
 }
@@ -43,7 +44,7 @@ pub(super) fn one_of<T: Copy>(draws: &mut Draws, list: &[T]) -> T {
 }
 
 impl Town {
-    /// Four houses on each of two sides, with gardens, hedges and trees between them.
+    /// Four houses on each of two sides of a block, with gardens, hedges and trees between them.
     pub(super) fn houses(&mut self, middle: DVec3, draws: &mut Draws) {
         let grass = self.materials.grass;
         self.level(middle, [BLOCK; 2], [3.25; 2], grass);
@@ -116,7 +117,7 @@ impl Town {
         }
     }
 
-    /// A house whose ridge runs along its width or its depth.
+    /// A house with a gabled roof, whose ridge runs along the house's width or depth.
     fn gabled(&mut self, shell: Shell, draws: &mut Draws) {
         self.walls(&shell, draws);
         let across = draws.unit64() < 0.4;
@@ -132,7 +133,7 @@ impl Town {
             let (wide, high) = (2.0 * d as f32 / 3.0, rise as f32 / 3.0);
             let uvs = [Vec2::ZERO, Vec2::new(wide, 0.0), Vec2::new(0.5 * wide, -high)];
             self.model.add(&corners, &[], &uvs, &[[0, 1, 2]], shell.walls.plain);
-            // The slope to the front. Both slopes meet at the ridge.
+            // The roof's slope on this side. Both slopes meet at the ridge.
             let (down, out) = (EAVES * slope.sin(), EAVES * slope.cos());
             let corner = side.at(-w - EAVES, eaves - down, d + out);
             let along = side.direction(2.0 * (w + EAVES), 0.0, 0.0);

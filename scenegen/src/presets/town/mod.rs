@@ -58,7 +58,7 @@ enum Use {
 /// The cycle of uses of consecutive blocks.
 const USES: [Use; 6] = [Use::Houses, Use::Flats, Use::Houses, Use::Park, Use::Houses, Use::Flats];
 
-/// A town under construction.
+/// A town that is being built.
 struct Town {
     model: Model,
     materials: Materials,

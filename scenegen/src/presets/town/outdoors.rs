@@ -12,7 +12,7 @@ const PARKED: f64 = 2.5;
 const LAMPS: f64 = 4.1;
 
 impl Town {
-    /// A tree behind most houses; `aside` is the house's position along its side of the block.
+    /// A tree behind a house, with a probability of 85 %; `aside` is the house's position along its side of the block.
     pub(super) fn garden(&mut self, side: &LocalFrame, aside: f64, draws: &mut Draws) {
         if draws.unit64() < 0.85 {
             let at = [between(draws, -2.0, 2.0), between(draws, 3.0, 4.6)];
@@ -30,7 +30,7 @@ impl Town {
         for cell in 0..36_u32 {
             let place = [f64::from(cell % 6) - 2.5, f64::from(cell / 6) - 2.5]
                 .map(|at| 6.0 * at + between(draws, -0.7, 0.7));
-            // Not on the paths around the fountain.
+            // No tree stands on the paths around the fountain.
             let out = place[0].hypot(place[1]);
             if draws.unit64() < 0.7 && !(5.5..10.5).contains(&out) && out > 5.5 {
                 self.tree(middle + dvec3(place[0], 0.0, place[1]), [1.5, 2.4], draws);

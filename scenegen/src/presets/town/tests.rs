@@ -15,7 +15,7 @@ fn town(size: u32, seed: u64) -> (Staging, Surface, [Vec<Camera>; 2]) {
     (staging, surface, [train, test])
 }
 
-/// The surface that a view shows at the centres of 16 x 12 cells.
+/// The surface points that a view shows at the centres of 16 x 12 cells.
 fn seen(surface: &Surface, camera: &Camera) -> Vec<Option<SurfaceHit>> {
     let cell = DVec2::new(f64::from(camera.width) / 16.0, f64::from(camera.height) / 12.0);
     let ray = |i: u32| {
@@ -32,13 +32,13 @@ fn views_are_outside_solids_and_mostly_show_surfaces() {
         for (i, camera) in views.iter().flatten().enumerate() {
             let seen = seen(&surface, camera);
             let met: Vec<&SurfaceHit> = seen.iter().flatten().collect();
-            let what = format!("town:{size} with seed {seed}, view {i} at {}", camera.centre);
-            assert!(met.len() * 10 > 6 * seen.len(), "{what}: {} of {}", met.len(), seen.len());
+            let name = format!("town:{size} with seed {seed}, view {i} at {}", camera.centre);
+            assert!(met.len() * 10 > 6 * seen.len(), "{name}: {} of {}", met.len(), seen.len());
             let backs = met.iter().filter(|hit| !hit.front).count();
-            assert_eq!(backs, 0, "{what} sees the back of a surface");
+            assert_eq!(backs, 0, "{name} sees the back of a surface");
             let nearest = met.iter().map(|hit| hit.t).fold(f64::INFINITY, f64::min);
-            assert!(nearest > 0.4, "{what}: {nearest} m");
-            assert!((0.8..=FLIGHT + 1.0).contains(&camera.centre.y), "{what}");
+            assert!(nearest > 0.4, "{name}: {nearest} m");
+            assert!((0.8..=FLIGHT + 1.0).contains(&camera.centre.y), "{name}");
         }
     }
 }

@@ -1,5 +1,5 @@
-//! Built-in scenes as datasets: `scene:spheres` is rendered in memory or read from the cache. The images
-//! are those that `densify scenegen --preset NAME` writes by default.
+//! Built-in scenes as datasets: `scene:NAME` is rendered in memory or read from the cache. Its images are those that
+//! `densify scenegen --preset NAME` writes by default.
 
 mod rendered;
 

@@ -93,10 +93,10 @@ impl<'a> Reader<'a> {
         self.input.seek_relative(bytes).map_err(LoadError::io(self.path))
     }
 
-    /// Reads the number of records, each of which takes at least `size` bytes.
-    fn count(&mut self, field: &str, size: u64, most: u64) -> Result<u64, LoadError> {
+    /// Reads the number of records, each of which takes at least `size` bytes; more than `max_count` are an error.
+    fn count(&mut self, field: &str, size: u64, max_count: u64) -> Result<u64, LoadError> {
         let count = self.u64(field)?;
-        if count > most || count > self.left / size {
+        if count > max_count || count > self.left / size {
             let problem = format!(
                 "the file says {count}, but the {} bytes that follow hold at most {}",
                 self.left,
@@ -151,20 +151,20 @@ pub(super) fn cameras(path: &Path) -> Result<HashMap<u32, Lens>, LoadError> {
 }
 
 /// Reads the number of images.
-fn image_count_of(reader: &mut Reader<'_>) -> Result<u64, LoadError> {
+fn read_image_count(reader: &mut Reader<'_>) -> Result<u64, LoadError> {
     // Id, pose, camera, the NUL of an empty name, number of observations.
     reader.count("number of images", 4 + 56 + 4 + 1 + 8, MAX_IMAGES)
 }
 
 /// Number of images in images.bin.
 pub(super) fn image_count(path: &Path) -> Result<u64, LoadError> {
-    image_count_of(&mut Reader::open(path)?)
+    read_image_count(&mut Reader::open(path)?)
 }
 
 /// Reads images.bin without its observations.
 pub(super) fn images(path: &Path) -> Result<Vec<Image>, LoadError> {
     let mut reader = Reader::open(path)?;
-    let count = image_count_of(&mut reader)?;
+    let count = read_image_count(&mut reader)?;
     let mut images = Vec::new();
     for _ in 0..count {
         let id = reader.u32("image id")?;

@@ -1,6 +1,6 @@
 //! Reads COLMAP sparse models: `images/` beside `sparse/N/{cameras,images,points3D}.{bin,txt}`.
 //!
-//! Rigs and frames of newer COLMAP versions are ignored, because `images.bin` still contains the poses.
+//! The rig and frame files of newer COLMAP versions are ignored, because `images.bin` still contains the poses.
 
 mod bin;
 mod camera;
@@ -35,7 +35,8 @@ const RENAME: &str = "rename the image and reconstruct the model again";
 /// Largest accepted numbers of images and points.
 const MAX_IMAGES: u64 = 1_000_000;
 const MAX_POINTS: u64 = 1 << 28;
-/// Largest difference between two copies of one pose that different programs wrote.
+/// Largest difference between two copies of one pose written by different programs: of an entry of the rotation, and of
+/// the position relative to 1 plus its distance from the origin.
 const SAME_POSE: f64 = 1e-5;
 
 /// One registered image.
@@ -76,14 +77,14 @@ struct Model {
 /// Folders of models, in order of precedence; the second is nerfstudio's.
 const PARENTS: [&str; 2] = ["sparse", "colmap/sparse"];
 
-/// Whether a folder has files of a model.
+/// Returns true if a folder contains a file of a model.
 fn is_model(folder: &Path) -> bool {
     let files = ["cameras.bin", "cameras.txt", "images.bin", "images.txt"];
     files.iter().any(|name| folder.join(name).is_file())
 }
 
-/// The folders of a dataset's models, relative to the dataset. COLMAP writes several models, numbered from 0, if not
-/// all images are connected.
+/// The folders of a dataset's models, relative to the dataset. COLMAP writes several models, numbered from 0, if it
+/// cannot connect all images.
 fn models(root: &Path) -> Vec<String> {
     for parent in PARENTS {
         let entries = fs::read_dir(root.join(parent)).into_iter().flatten().flatten();
@@ -103,7 +104,7 @@ fn models(root: &Path) -> Vec<String> {
 
 /// The model to read (the user's choice, or the first of those with the most images) and a note about the other models.
 #[derive(Debug)]
-struct Choice {
+struct ChosenModel {
     folder: PathBuf,
     /// Folder that the model's files may not leave.
     root: Root,
@@ -111,19 +112,19 @@ struct Choice {
 }
 
 /// Chooses the model, if there is one.
-fn choose(root: &Root, chosen: Option<&Path>) -> Result<Option<Choice>, LoadError> {
+fn choose_model(root: &Root, requested: Option<&Path>) -> Result<Option<ChosenModel>, LoadError> {
     let models = models(root.path());
-    if let Some(folder) = chosen {
+    if let Some(folder) = requested {
         let folder = root.path().join(folder);
         if !is_model(&folder) {
-            let there = if models.is_empty() { "none".to_owned() } else { models.join(", ") };
+            let existing = if models.is_empty() { "none".to_owned() } else { models.join(", ") };
             let problem = format!(
-                "{}: this is not a COLMAP model (the dataset has {there})",
+                "{}: this is not a COLMAP model (the dataset has {existing})",
                 folder.display()
             );
             return Err(LoadError::Remedied { problem, remedy: LoadRemedy::ColmapModel });
         }
-        return Ok(Some(Choice { root: Root::new(&folder)?, folder, others: None }));
+        return Ok(Some(ChosenModel { root: Root::new(&folder)?, folder, others: None }));
     }
     let several = models.len() > 1;
     // The images of a single model need not be counted, as there is nothing to choose.
@@ -137,7 +138,7 @@ fn choose(root: &Root, chosen: Option<&Path>) -> Result<Option<Choice>, LoadErro
     let (model, images) = counted.remove(largest);
     let folder = root.path().join(&model);
     let others = several.then_some(Note::OtherModels { model, images, others: counted });
-    Ok(Some(Choice { folder, root: root.clone(), others }))
+    Ok(Some(ChosenModel { folder, root: root.clone(), others }))
 }
 
 /// Number of images in a model.
@@ -153,7 +154,7 @@ fn image_count(root: &Root, model: &str) -> Result<u64, LoadError> {
     }
 }
 
-/// The path of a model's file: the binary file if it exists, otherwise the text file. It may not link out of `root`.
+/// The path of a model's file: the binary file if it exists, otherwise the text file. Links out of `root` are errors.
 fn file(root: &Root, folder: &Path, name: &str) -> Result<PathBuf, LoadError> {
     let [binary, text] = ["bin", "txt"].map(|ending| folder.join(format!("{name}.{ending}")));
     // If neither exists, the kind of the model's other files decides which path is returned.
@@ -169,14 +170,14 @@ fn is_binary(path: &Path) -> bool {
     path.extension().is_some_and(|ending| ending == "bin")
 }
 
-/// Reads the model in a folder, if there is one.
+/// Reads the COLMAP model of a dataset, if there is one.
 ///
 /// # Errors
 /// When a file is missing, damaged, or contradicts another.
 fn read(root: &Root, options: &LoadOptions) -> Result<Option<Scene>, LoadError> {
-    let Some(choice) = choose(root, options.sparse.as_deref())? else { return Ok(None) };
+    let Some(chosen) = choose_model(root, options.sparse.as_deref())? else { return Ok(None) };
     let folders = Folders::new(root, options, true)?;
-    let ([cameras, images, points], model) = model(&choice, options.tracks)?;
+    let ([cameras, images, points], model) = model(&chosen, options.tracks)?;
     let mut frames = Vec::with_capacity(model.images.len());
     let mut reduced_missing = 0;
     for image in model.images {
@@ -204,11 +205,11 @@ fn read(root: &Root, options: &LoadOptions) -> Result<Option<Scene>, LoadError> 
             held_out: false,
         });
     }
-    let mut notes: Vec<Note> = choice.others.iter().cloned().collect();
+    let mut notes: Vec<Note> = chosen.others.iter().cloned().collect();
     let (posed, others) = (frames.len(), folders.count_others(&frames));
     if others > 0 {
-        let is_one_of_several = choice.others.is_some() || options.sparse.is_some();
-        let folder = choice.folder.strip_prefix(root.path()).unwrap_or(&choice.folder);
+        let is_one_of_several = chosen.others.is_some() || options.sparse.is_some();
+        let folder = chosen.folder.strip_prefix(root.path()).unwrap_or(&chosen.folder);
         let model = match is_one_of_several {
             true => format!("{} has", folder.display()),
             false => "COLMAP has found".to_owned(),
@@ -235,9 +236,9 @@ fn read(root: &Root, options: &LoadOptions) -> Result<Option<Scene>, LoadError> 
     }))
 }
 
-/// The paths and contents of a model's three files. The file of the points may be missing.
+/// The paths and contents of a model's three files. The points file may be missing.
 fn model(
-    Choice { folder, root, .. }: &Choice,
+    ChosenModel { folder, root, .. }: &ChosenModel,
     with_tracks: bool,
 ) -> Result<([PathBuf; 3], Model), LoadError> {
     let path = |name: &str| file(root, folder, name);
@@ -259,8 +260,8 @@ fn model(
 /// have the same poses, as in datasets that `densify scenegen` writes. Otherwise the model is ignored, as it may belong
 /// to another scene.
 pub(super) fn adopt_tracks(root: &Root, scene: &mut Scene) {
-    let Ok(Some(choice)) = choose(root, None) else { return };
-    let Ok((_, model)) = model(&choice, true) else { return };
+    let Ok(Some(chosen)) = choose_model(root, None) else { return };
+    let Ok((_, model)) = model(&chosen, true) else { return };
     let by_name: HashMap<String, &Image> =
         model.images.iter().map(|image| (relative(&image.name), image)).collect();
     let mut matched = false;
@@ -273,9 +274,9 @@ pub(super) fn adopt_tracks(root: &Root, scene: &mut Scene) {
             continue;
         };
         let centre = |rotation: DMat3, t: DVec3| -(rotation.transpose() * t);
-        let here = centre(frame.rotation, frame.translation);
-        let there = centre(image.rotation, image.translation);
-        let moved = here.distance(there) > SAME_POSE * (1.0 + there.length());
+        let frame_at = centre(frame.rotation, frame.translation);
+        let image_at = centre(image.rotation, image.translation);
+        let moved = frame_at.distance(image_at) > SAME_POSE * (1.0 + image_at.length());
         let same_rotation = frame.rotation.abs_diff_eq(image.rotation, SAME_POSE);
         if moved || !same_rotation {
             return;

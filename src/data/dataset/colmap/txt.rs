@@ -19,7 +19,7 @@ use super::camera;
 use super::{Image, MAX_IMAGES, MAX_POINTS, REMEDY, RENAME};
 use densify_core::files;
 
-/// Longest line accepted `[bytes]`. The longest lines list the observations of an image, about 40 bytes for each.
+/// Longest line accepted `[bytes]`. The longest lines list an image's observations of about 40 bytes each.
 const MAX_LINE: u64 = 64 << 20;
 
 struct Lines<'a> {
@@ -86,7 +86,7 @@ impl<'a> Lines<'a> {
         words: &mut SplitWhitespace<'_>,
         field: &str,
     ) -> Result<T, LoadError> {
-        let word = words.next().ok_or_else(|| self.fault(field, "the line ends before it"))?;
+        let word = words.next().ok_or_else(|| self.fault(field, "the line ends too early"))?;
         word.parse().map_err(|_| {
             let word: String = word.chars().take(40).collect();
             self.fault(field, format!("{word:?} is not a valid number"))
@@ -134,7 +134,7 @@ pub(super) fn cameras(path: &Path) -> Result<HashMap<u32, Lens>, LoadError> {
 pub(super) fn images(path: &Path) -> Result<Vec<Image>, LoadError> {
     let mut lines = Lines::open(path)?;
     let mut images = Vec::new();
-    // Whether the line of the next image has been read.
+    // True if the first line of the next image has already been read.
     let mut is_ahead = false;
     while is_ahead || lines.advance_to_record()? {
         let text = lines.text()?;
@@ -155,7 +155,7 @@ pub(super) fn images(path: &Path) -> Result<Vec<Image>, LoadError> {
         }
         lines.advance()?;
         let is_comment = lines.line.trim_ascii_start().starts_with(b"#");
-        is_ahead = !is_comment && has_words(lines.text()?);
+        is_ahead = !is_comment && has_non_number(lines.text()?);
         if is_ahead || is_comment {
             continue;
         }
@@ -174,9 +174,9 @@ pub(super) fn images(path: &Path) -> Result<Vec<Image>, LoadError> {
     Ok(images)
 }
 
-/// Returns true if a line contains a word that is not a number, such as the name of an image. Only lines of
-/// observations have more than 100 words.
-fn has_words(text: &str) -> bool {
+/// Returns true if a line contains a word that is not a number, such as the name of an image. Only the first 100 words
+/// are tested, because only lines of observations have more.
+fn has_non_number(text: &str) -> bool {
     text.split_whitespace().take(100).any(|word| word.parse::<f64>().is_err())
 }
 

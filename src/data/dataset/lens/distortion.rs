@@ -10,7 +10,7 @@ use super::Projection;
 /// p becomes p·(1 + a₁r² + a₂r⁴ + a₃r⁶ + a₄r⁸) / (1 + b₁r² + b₂r⁴ + b₃r⁶), plus the tangential and thin-prism parts.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Distortion {
-    /// The projection to the plane that is distorted.
+    /// The projection to the plane, before distortion.
     pub(crate) plane: Projection,
     /// a₁ to a₄.
     pub(crate) radial: [f64; 4],
@@ -84,7 +84,7 @@ impl Distortion {
         let mut miss = self.apply(p) - target;
         for _ in 0..STEPS {
             let mut step = self.jacobian(p).inverse() * miss;
-            // The Jacobian is regular within the invertible radius, so that a short enough step always improves.
+            // The Jacobian is regular within the invertible radius, so a short step always approaches the target.
             let next = loop {
                 let next = (p - step).clamp_length_max(reach);
                 let missed = self.apply(next) - target;

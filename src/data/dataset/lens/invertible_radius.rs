@@ -62,7 +62,7 @@ impl Distortion {
         }
         let factor = minus_reduced(n, &m);
         let slope = minus_reduced(slope, &product(&m, &m));
-        [m, factor, slope].iter().all(|p| lowest(p, from, to) > 0.0)
+        [m, factor, slope].iter().all(|p| lower_bound(p, from, to) > 0.0)
     }
 }
 
@@ -76,8 +76,8 @@ fn product(a: &[f64], b: &[f64]) -> Vec<f64> {
     product
 }
 
-/// A lower bound of a polynomial, lowest coefficient first, on an interval; NaN where it is not finite.
-fn lowest(polynomial: &[f64], from: f64, to: f64) -> f64 {
+/// A lower bound of a polynomial on an interval, NaN if not finite. Coefficients are in order of increasing power.
+fn lower_bound(polynomial: &[f64], from: f64, to: f64) -> f64 {
     // Repeated Horner's scheme gives the coefficients of P(from + x).
     let mut shifted = polynomial.to_vec();
     for done in 0..shifted.len() {
@@ -87,9 +87,9 @@ fn lowest(polynomial: &[f64], from: f64, to: f64) -> f64 {
     }
     let length = to - from;
     let (mut bound, mut power) = (0.0, 1.0);
-    for (place, &coefficient) in shifted.iter().enumerate() {
+    for (index, &coefficient) in shifted.iter().enumerate() {
         // The constant counts whatever its sign is; `coefficient.min(0.0)` would hide NaN.
-        let least = if place > 0 && coefficient > 0.0 { 0.0 } else { coefficient };
+        let least = if index > 0 && coefficient > 0.0 { 0.0 } else { coefficient };
         bound += least * power;
         power *= length;
     }
@@ -107,13 +107,13 @@ mod tests {
         let value = |x: f64| p.iter().rev().fold(0.0, |sum, c| sum * x + c);
         for from in [0.0, 0.7, 2.0] {
             for length in [1.0, 0.1, 1e-4] {
-                let bound = lowest(&p, from, from + length);
+                let bound = lower_bound(&p, from, from + length);
                 let values = (0..=100).map(|i| value(from + length * f64::from(i) / 100.0));
                 let least = values.fold(f64::INFINITY, f64::min);
                 assert!(bound <= least + 1e-12 && bound > least - 10.0 * length, "{from} {length}");
             }
         }
-        assert!(lowest(&[1.0, f64::NAN], 0.0, 1.0).is_nan());
+        assert!(lower_bound(&[1.0, f64::NAN], 0.0, 1.0).is_nan());
     }
 
     #[test]

@@ -49,7 +49,7 @@ pub(crate) struct Lens {
 pub(crate) enum Unseen {
     /// The distortion has no inverse at the pixel.
     Folds,
-    /// The angle from the axis is larger than the largest supported angle.
+    /// The angle from the axis exceeds the largest supported angle.
     TooWide,
 }
 
@@ -104,7 +104,7 @@ impl Lens {
     }
 
     /// The point on the undistorted plane to which a ray projects; `None` if the ray is too far from the axis.
-    fn on_plane(&self, direction: DVec3) -> Option<DVec2> {
+    fn plane_from_ray(&self, direction: DVec3) -> Option<DVec2> {
         let (flat, plane) = (direction.truncate(), self.distortion.plane);
         if plane == Projection::Perspective {
             return (direction.z > 0.0).then(|| flat / direction.z);
@@ -121,19 +121,19 @@ impl Lens {
     pub(crate) fn project(&self, direction: DVec3) -> Option<DVec2> {
         // A relative 1e-9 is far below a pixel, and above the rounding of a point on the rim.
         let is_within = |p: &DVec2| p.length() <= self.reach * (1.0 + 1e-9);
-        self.on_plane(direction).filter(is_within).map(|p| self.imaged(p))
+        self.plane_from_ray(direction).filter(is_within).map(|p| self.pixel_from_plane(p))
     }
 
     /// Projection of a ray `[px]`, even where the distortion is not invertible.
     pub(crate) fn extrapolate(&self, direction: DVec3) -> Option<DVec2> {
-        self.on_plane(direction).map(|p| self.imaged(p))
+        self.plane_from_ray(direction).map(|p| self.pixel_from_plane(p))
     }
 
-    fn imaged(&self, on_plane: DVec2) -> DVec2 {
-        self.distortion.apply(on_plane) * self.focal + self.principal
+    fn pixel_from_plane(&self, point: DVec2) -> DVec2 {
+        self.distortion.apply(point) * self.focal + self.principal
     }
 
-    /// The ray, not normalised, that is imaged at a point `[px]`.
+    /// The ray, not normalised, that projects to a point of the image `[px]`.
     ///
     /// # Errors
     /// When no such ray is known.

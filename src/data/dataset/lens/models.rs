@@ -12,9 +12,9 @@ pub(crate) enum Term {
     Radial(usize),
     /// Coefficient of r², r⁴ or r⁶ in the denominator, by index.
     Denominator(usize),
-    /// p1 or p2.
+    /// p₁ or p₂, by index.
     Tangential(usize),
-    /// Shift of the thin prism along x or y.
+    /// Shift of the thin prism along x or y, by index.
     Prism(usize),
     /// The angle ω of the FOV model `[rad]`.
     Omega,
@@ -69,7 +69,7 @@ const UNSUPPORTED: [&str; 7] = [
     "EQUIRECTANGULAR",
 ];
 
-/// Distortion fields of nerfstudio's and instant-ngp's pinholes: OpenCV's terms under OpenCV's names.
+/// Distortion fields of nerfstudio's and instant-ngp's pinholes: OpenCV's terms, with OpenCV's names.
 pub(crate) const OPENCV_FIELDS: [(&str, Term); 8] = [
     ("k1", A(0)),
     ("k2", A(1)),
@@ -110,10 +110,10 @@ impl Distortion {
     /// Sets the coefficient of a term.
     pub(crate) fn set(&mut self, term: Term, value: f64) {
         match term {
-            A(place) => self.radial[place] = value,
-            B(place) => self.denominator[place] = value,
-            P(place) => self.tangential[place] = value,
-            S(place) => self.prism[place] = value,
+            A(index) => self.radial[index] = value,
+            B(index) => self.denominator[index] = value,
+            P(index) => self.tangential[index] = value,
+            S(index) => self.prism[index] = value,
             // For ω = 0 the model is a pinhole.
             Omega if value == 0.0 => {}
             Omega => self.plane = Projection::Fov(value),

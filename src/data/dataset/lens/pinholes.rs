@@ -29,7 +29,7 @@ pub(crate) enum PinholeError {
     Folds(f64),
     /// No pinhole image of a useful size shows a part of the photograph.
     #[error("no part of the photograph can be shown by a pinhole camera")]
-    Nothing,
+    NothingVisible,
 }
 
 /// Samples along a side of the photograph. Between two samples, a border that bulges by 100 px over the whole side
@@ -37,8 +37,9 @@ pub(crate) enum PinholeError {
 const SAMPLES: u32 = 64;
 /// Cells along each side of a face that are tested for visibility.
 const CELLS: usize = 128;
-/// Steepest ray of a single pinhole, x/z: 65 degrees for a fisheye, 80 degrees for a distorted pinhole. Up to these
-/// angles, cube faces cost up to 4 dB in test views as wide as the photographs (docs/studies/wide-fisheyes.tsv).
+/// Steepest ray of a single pinhole, x/z: 65 degrees for a fisheye, 80 degrees for a distorted pinhole. Below these
+/// angles a pinhole is better: cube faces cost up to 4 dB in test views as wide as the photographs
+/// (docs/studies/wide-fisheyes.tsv).
 const STEEPEST: f64 = 2.15;
 const STEEPEST_PERSPECTIVE: f64 = 5.67;
 /// Smallest side of a face that becomes a view, x/z.
@@ -54,8 +55,8 @@ struct Rectangle {
 }
 
 impl Rectangle {
-    fn is_within(&self, most: f64) -> bool {
-        self.low.cmpge(DVec2::splat(-most)).all() && self.high.cmple(DVec2::splat(most)).all()
+    fn is_within(&self, limit: f64) -> bool {
+        self.low.cmpge(DVec2::splat(-limit)).all() && self.high.cmple(DVec2::splat(limit)).all()
     }
 }
 
@@ -72,23 +73,23 @@ impl Pinholes {
         let rays = || seen.iter().filter_map(|(_, ray)| ray.ok());
         let is_whole = rays().count() == seen.len();
         let perspective = lens.distortion.plane == Projection::Perspective;
-        let most = if perspective { STEEPEST_PERSPECTIVE } else { STEEPEST };
+        let steepest = if perspective { STEEPEST_PERSPECTIVE } else { STEEPEST };
         // A little less than the cosine of the largest angle that projections through tan θ support.
         let is_forward = rays().all(|ray| ray.z > 0.08 * ray.length());
         let flat = |ray: DVec3| ray.truncate() / ray.z;
-        let all = rays().fold(None, |all: Option<Rectangle>, ray| {
+        let bounds = rays().fold(None, |bounds: Option<Rectangle>, ray| {
             let at = flat(ray);
-            let all = all.unwrap_or(Rectangle { low: at, high: at });
-            Some(Rectangle { low: all.low.min(at), high: all.high.max(at) })
+            let bounds = bounds.unwrap_or(Rectangle { low: at, high: at });
+            Some(Rectangle { low: bounds.low.min(at), high: bounds.high.max(at) })
         });
-        let all = all.ok_or(PinholeError::Nothing)?;
+        let bounds = bounds.ok_or(PinholeError::NothingVisible)?;
         let inner = if is_forward && is_whole && !keep_fov { inscribed(&seen, flat) } else { None };
-        let faces = if let Some(inner) = inner.filter(|inner| inner.is_within(most)) {
+        let faces = if let Some(inner) = inner.filter(|inner| inner.is_within(steepest)) {
             // A distorted pinhole keeps its image size.
             let size = perspective.then_some((lens.width, lens.height));
             vec![("", face(lens, DMat3::IDENTITY, inner, size, false))]
-        } else if is_forward && all.is_within(most) {
-            visible_part(lens, DMat3::IDENTITY, all, keep_fov)
+        } else if is_forward && bounds.is_within(steepest) {
+            visible_part(lens, DMat3::IDENTITY, bounds, keep_fov)
                 .map(|face| ("", face))
                 .into_iter()
                 .collect()
@@ -98,7 +99,7 @@ impl Pinholes {
             cube().into_iter().filter_map(face).collect::<Vec<_>>()
         };
         if faces.is_empty() {
-            return Err(PinholeError::Nothing);
+            return Err(PinholeError::NothingVisible);
         }
         let shown = |ray: DVec3| faces.iter().any(|(_, face)| face.shows(ray));
         let lost = seen.iter().filter(|(_, ray)| !ray.is_ok_and(shown)).count();
@@ -128,7 +129,8 @@ fn grid(lens: &Lens) -> Vec<(DVec2, Result<DVec3, Unseen>)> {
     places.map(|place| (place, lens.unproject(place))).collect()
 }
 
-/// The rectangle between the innermost points of the four borders; `None` if it does not contain the axis.
+/// The rectangle between the innermost points of the four borders; `None` if it excludes the axis or a point has no
+/// ray.
 fn inscribed(
     seen: &[(DVec2, Result<DVec3, Unseen>)],
     flat: impl Fn(DVec3) -> DVec2,
@@ -136,7 +138,7 @@ fn inscribed(
     let row = SAMPLES as usize + 1;
     let (mut low, mut high) = (DVec2::NEG_INFINITY, DVec2::INFINITY);
     for at in 0..row {
-        let border = |place: usize| seen[place].1.ok().map(&flat);
+        let border = |index: usize| seen[index].1.ok().map(&flat);
         low.x = low.x.max(border(at * row)?.x);
         high.x = high.x.min(border(at * row + row - 1)?.x);
         low.y = low.y.max(border(at)?.y);
@@ -157,10 +159,10 @@ fn visible_part(
     let step = (within.high - within.low) / CELLS as f64;
     let at = |x: usize, y: usize| within.low + step * DVec2::new(x as f64, y as f64);
     let is_seen = |x, y| {
-        let place = lens.project(turn * at(x, y).extend(1.0));
+        let pixel = lens.project(turn * at(x, y).extend(1.0));
         // The ray of a border pixel is projected back to the border up to rounding.
         let inside = |p: DVec2| (p.cmpge(DVec2::splat(-1e-6)) & p.cmple(lens.size() + 1e-6)).all();
-        place.is_some_and(inside)
+        pixel.is_some_and(inside)
     };
     let row = CELLS + 1;
     let corners: Vec<bool> = (0..row * row).map(|i| is_seen(i % row, i / row)).collect();
@@ -173,9 +175,9 @@ fn visible_part(
     let whole: Vec<bool> = cells.iter().map(|cell| *cell == [true; 4]).collect();
     let ([x0, y0], [x1, y1]) = if keep_fov {
         let any: Vec<bool> = cells.iter().map(|cell| cell.contains(&true)).collect();
-        bounding(&any)?
+        bounding_rectangle(&any)?
     } else {
-        largest(&whole)?
+        largest_rectangle(&whole)?
     };
     let rectangle = Rectangle { low: at(x0, y0), high: at(x1, y1) };
     let is_useful = keep_fov
@@ -185,7 +187,7 @@ fn visible_part(
     is_useful.then(|| face(lens, turn, rectangle, None, masked))
 }
 
-/// The pinhole that shows a rectangle, at a given size or with the lens's number of pixels per radian on the axis.
+/// The pinhole that shows a rectangle, in an image of `size` or with the lens's pixels per radian on the axis.
 fn face(
     lens: &Lens,
     turn: DMat3,
@@ -204,16 +206,16 @@ fn face(
     Undistortion { from: *lens, to, lens_from_pinhole: turn, masked }
 }
 
-/// The smallest rectangle that contains all set cells: first column and row, and last column and row plus 1.
-fn bounding(set: &[bool]) -> Option<([usize; 2], [usize; 2])> {
+/// The smallest rectangle around all set cells: its first column and row, and those after its last column and row.
+fn bounding_rectangle(set: &[bool]) -> Option<([usize; 2], [usize; 2])> {
     let places = || (0..set.len()).filter(|&i| set[i]).map(|i| [i % CELLS, i / CELLS]);
     let low = [0, 1].map(|axis| places().map(|place| place[axis]).min());
     let high = [0, 1].map(|axis| places().map(|place| place[axis] + 1).max());
     Some(([low[0]?, low[1]?], [high[0]?, high[1]?]))
 }
 
-/// The largest rectangle in which all cells are set, in the form of [`bounding`].
-fn largest(set: &[bool]) -> Option<([usize; 2], [usize; 2])> {
+/// The largest rectangle in which all cells are set, in the form of [`bounding_rectangle`].
+fn largest_rectangle(set: &[bool]) -> Option<([usize; 2], [usize; 2])> {
     // Number of consecutive set cells that end in this row, for each column.
     let mut heights = [0; CELLS];
     let mut best = (0, None);

@@ -12,7 +12,7 @@ pub(crate) enum Projection {
 }
 
 /// Largest supported angle from the axis for projections through tan θ, which is infinite at 90 degrees `[rad]`. A
-/// pinhole's pixel there covers about 1/1,500 of the solid angle of one at the centre.
+/// pinhole's pixel there covers about 1/1,500 of the solid angle of a pixel at the centre.
 const WIDEST: f64 = 85.0_f64.to_radians();
 /// Largest supported angle from the axis for fisheyes `[rad]`. Wide lenses are resampled to the faces of a cube
 /// (`pinholes.rs`), whose side faces reach a little farther.
@@ -37,8 +37,8 @@ impl Projection {
         }
     }
 
-    /// Derivative of [`Self::radius`] on the axis: the focal length, in units of the lens's, of a pinhole with the same
-    /// number of pixels per radian there.
+    /// Derivative of [`Self::radius`] on the axis: the focal length, relative to that of the lens, of a pinhole with
+    /// the same number of pixels per radian on the axis.
     pub(crate) fn slope(self) -> f64 {
         match self {
             Self::Perspective | Self::Equidistant => 1.0,

@@ -100,7 +100,7 @@ const REFERENCES: [Reference; 7] = [
 ];
 
 #[test]
-fn rays_are_imaged_where_colmap_images_them() {
+fn rays_project_where_colmap_projects_them() {
     for (name, parameters, places) in REFERENCES {
         let lens = lens(name, parameters);
         for (ray, place) in RAYS.into_iter().zip(places) {
@@ -110,7 +110,7 @@ fn rays_are_imaged_where_colmap_images_them() {
     }
 }
 
-/// The lenses above, and stronger ones of each kind.
+/// The lenses above, and lenses of each kind with a stronger distortion.
 fn lenses() -> Vec<(&'static str, Lens)> {
     let mut all: Vec<_> = REFERENCES.iter().map(|(name, p, _)| (*name, lens(name, p))).collect();
     let opencv = |k: [f64; 4]| lens("OPENCV", &[&[210.0, 214.0, 150.0, 92.0], &k[..]].concat());
@@ -118,7 +118,7 @@ fn lenses() -> Vec<(&'static str, Lens)> {
         ("barrel", opencv([-0.12, 0.02, 0.0, 0.0])),
         ("pincushion", opencv([0.3, 0.0, 2e-3, -3e-3])),
         ("tangential", opencv([0.0, 0.0, 0.0, 1e-3])),
-        // 204 by 125 degrees, and 239 from corner to corner.
+        // A field of view of 204 by 125 degrees, and of 239 from corner to corner.
         ("wide", lens("OPENCV_FISHEYE", &[85.0, 85.0, 151.0, 93.0, 0.01, -0.002, 0.0, 0.0])),
         ("circle", lens("SIMPLE_RADIAL_FISHEYE", &[95.0, 150.0, 92.0, -0.01])),
         ("tango", lens("FOV", &[120.0, 121.0, 150.0, 92.0, 1.2])),
@@ -194,7 +194,7 @@ fn a_pinhole_sees_only_what_the_lens_saw_and_reaches_every_side_of_the_photograp
 
 /// Faces do not overlap: a ray falls into exactly one of them, except on common edges.
 #[test]
-fn a_wide_field_becomes_faces_of_a_cube() {
+fn a_wide_field_of_view_becomes_faces_of_a_cube() {
     for (name, expected) in [
         ("wide", &["front", "left", "right", "up", "down"][..]),
         ("OPENCV_FISHEYE", &["front", "left", "right"]),
@@ -231,7 +231,7 @@ fn a_distortion_that_folds_over_is_refused_or_used_up_to_the_fold() {
     let nan = lens("OPENCV", &[210.0, 214.0, 150.0, 92.0, f64::NAN, 0.0, 0.0, 0.0]);
     assert!(
         Pinholes::covering(&nan, false).is_err()
-            && Pinholes::covering(&nan, true) == Err(PinholeError::Nothing)
+            && Pinholes::covering(&nan, true) == Err(PinholeError::NothingVisible)
     );
     // An image that does not contain the optical axis, such as a crop, is still usable.
     let aside = lens("OPENCV", &[210.0, 214.0, -40.0, 92.0, 0.058, 0.0, 0.0, 0.0]);
@@ -242,7 +242,7 @@ fn a_distortion_that_folds_over_is_refused_or_used_up_to_the_fold() {
 /// After undistortion, dots that were drawn at the lens's projections of known rays lie at the pinhole's projections of
 /// these rays.
 #[test]
-fn dots_land_where_pinholes_project_them() {
+fn undistorted_dots_lie_where_pinholes_project_them() {
     for (name, lens) in lenses() {
         let (width, height) = SIZE;
         let centre = |index: usize, width: u32| {

@@ -17,7 +17,7 @@ struct Packed {
 }
 
 impl Packed {
-    fn of(bytes: &[u8]) -> Self {
+    fn new(bytes: &[u8]) -> Self {
         let folder = tempfile::tempdir().unwrap();
         std::fs::write(folder.path().join("my scan.zip"), bytes).unwrap();
         Self { folder }
@@ -35,12 +35,12 @@ impl Packed {
 /// The files below a folder with their relative paths.
 fn files(folder: &Path) -> Vec<(String, Vec<u8>)> {
     let mut found = Vec::new();
-    let mut open = vec![folder.to_owned()];
-    while let Some(here) = open.pop() {
-        for entry in std::fs::read_dir(&here).unwrap() {
+    let mut stack = vec![folder.to_owned()];
+    while let Some(current) = stack.pop() {
+        for entry in std::fs::read_dir(&current).unwrap() {
             let path = entry.unwrap().path();
             if path.is_dir() {
-                open.push(path);
+                stack.push(path);
             } else {
                 let name = path.strip_prefix(folder).unwrap().to_str().unwrap().to_owned();
                 found.push((name, std::fs::read(&path).unwrap()));
@@ -51,12 +51,12 @@ fn files(folder: &Path) -> Vec<(String, Vec<u8>)> {
     found
 }
 
-/// Packs files under names with a prefix.
-fn pack(files: &[(String, Vec<u8>)], before: &str, method: CompressionMethod) -> Vec<u8> {
+/// Packs files with `prefix` before their names.
+fn pack(files: &[(String, Vec<u8>)], prefix: &str, method: CompressionMethod) -> Vec<u8> {
     let mut writer = ZipWriter::new(Cursor::new(Vec::new()));
     let options = SimpleFileOptions::default().compression_method(method);
     for (name, contents) in files {
-        writer.start_file(format!("{before}{name}"), options).unwrap();
+        writer.start_file(format!("{prefix}{name}"), options).unwrap();
         writer.write_all(contents).unwrap();
     }
     writer.finish().unwrap().into_inner()
@@ -99,7 +99,7 @@ fn with_edited_headers(
     bytes
 }
 
-/// The folder that an archive is unpacked in, according to the note.
+/// The folder in which an archive is unpacked, according to the note.
 fn unpacked_in(data: &Dataset) -> PathBuf {
     let parts = data.notes.iter().find_map(|note| match note {
         Note::Text(text) => text.split_once(" is unpacked in "),
@@ -119,7 +119,7 @@ fn an_archive_loads_like_its_folder() {
     for made in [Made::colmap_txt(), Made::colmap_bin(), names, Made::realitycapture()] {
         let folder = Dataset::load(made.path(), &LoadOptions::default()).unwrap();
         let files = files(made.path());
-        let with_rubbish = [
+        let with_system_files = [
             files.clone(),
             vec![
                 ("__MACOSX/._images".to_owned(), b"?".to_vec()),
@@ -133,11 +133,11 @@ fn an_archive_loads_like_its_folder() {
             pack(&files, "", CompressionMethod::Stored),
             pack(&files, "", CompressionMethod::Deflated),
             pack(&files, "Scan/", CompressionMethod::Deflated),
-            pack(&with_rubbish, "", CompressionMethod::Deflated),
+            pack(&with_system_files, "", CompressionMethod::Deflated),
             pack(&files, "Küche – neu/2026 11/", CompressionMethod::Deflated),
             pack(&backslashes, "", CompressionMethod::Deflated),
         ] {
-            let archive = Packed::of(&bytes);
+            let archive = Packed::new(&bytes);
             let data = archive.load().unwrap_or_else(|error| panic!("{error}"));
             assert_eq!(data.points, folder.points);
             assert_eq!((data.train.len(), data.root.clone()), (3, archive.path()));
@@ -154,7 +154,7 @@ fn an_archive_loads_like_its_folder() {
 
 #[test]
 fn the_unpacked_folder_lives_as_long_as_a_view() {
-    let archive = Packed::of(&packed(&Made::colmap_txt()));
+    let archive = Packed::new(&packed(&Made::colmap_txt()));
     let data = archive.load().unwrap();
     let place = unpacked_in(&data);
     let view = data.train[1].clone();
@@ -166,7 +166,7 @@ fn the_unpacked_folder_lives_as_long_as_a_view() {
     // A refused archive leaves nothing behind either.
     let made = Made::colmap_txt();
     made.remove("images/b.png");
-    let error = Packed::of(&packed(&made)).load().unwrap_err().to_string();
+    let error = Packed::new(&packed(&made)).load().unwrap_err().to_string();
     assert!(error.contains("my scan.zip/sparse/0/images.txt"), "{error}");
     assert!(error.contains("my scan.zip/images/b.png does not exist"), "{error}");
     assert!(!error.contains("densify-zip-"), "{error}");
@@ -177,7 +177,7 @@ fn the_unpacked_folder_lives_as_long_as_a_view() {
 fn masks_and_points_are_read_from_the_archive() {
     let made = Made::colmap_txt();
     write_mask(&made.file("masks/b.png"), |x| if x < 10 { 0 } else { 255 });
-    let archive = Packed::of(&pack(&files(made.path()), "a/b/", CompressionMethod::Stored));
+    let archive = Packed::new(&pack(&files(made.path()), "a/b/", CompressionMethod::Stored));
     let data = archive.load().unwrap();
     let source = &data.train[1].source;
     assert_eq!(source.load().unwrap().mask.unwrap()[..2], [0, 0]);
@@ -185,23 +185,23 @@ fn masks_and_points_are_read_from_the_archive() {
     assert_eq!(*shown, archive.path().join("masks/b.png"));
     let made = Made::transforms(|_| ());
     made.replace("points.ply", "\n3 0 0.5", "\nnan 0 0.5");
-    let data = Packed::of(&packed(&made)).load().unwrap();
+    let data = Packed::new(&packed(&made)).load().unwrap();
     assert_noted(&data, "1 of 200");
 }
 
 #[test]
 fn models_are_not_datasets() {
     let model = [("meta.json".to_owned(), b"{}".to_vec())];
-    assert!(!is_archive(&Packed::of(&pack(&model, "", CompressionMethod::Stored)).path()));
+    assert!(!is_archive(&Packed::new(&pack(&model, "", CompressionMethod::Stored)).path()));
     let inside = pack(&model, "scene/", CompressionMethod::Stored);
-    assert!(!is_archive(&Packed::of(&inside).path()), "in a folder");
-    let archive = Packed::of(&packed(&Made::colmap_txt()));
+    assert!(!is_archive(&Packed::new(&inside).path()), "in a folder");
+    let archive = Packed::new(&packed(&Made::colmap_txt()));
     assert!(is_archive(&archive.path()) && !is_archive(archive.folder.path()));
     refused("a model", &pack(&model, "", CompressionMethod::Stored), "is not a dataset");
 }
 
 fn refused(case: &str, bytes: &[u8], words: &str) {
-    let archive = Packed::of(bytes);
+    let archive = Packed::new(bytes);
     let Err(error) = archive.load() else { panic!("{case}: it loaded") };
     let message = error.to_string();
     for word in words.split(", ").chain(["my scan.zip"]) {
@@ -227,7 +227,7 @@ fn unsafe_archives_are_refused() {
     ] {
         match words {
             // An odd spelling of a path is accepted if no other file has that path.
-            "" => assert!(Packed::of(&renamed(&whole, name, new)).load().is_ok(), "{case}"),
+            "" => assert!(Packed::new(&renamed(&whole, name, new)).load().is_ok(), "{case}"),
             _ => refused(case, &renamed(&whole, name, new), words),
         }
     }
@@ -262,10 +262,10 @@ fn damaged_archives_are_refused() {
     refused("a checksum", &other, "sparse/0/cameras.txt, cannot be unpacked");
     // Truncation at any place.
     for kept in (0..whole.len()).step_by(97) {
-        let archive = Packed::of(&whole[..kept]);
+        let archive = Packed::new(&whole[..kept]);
         let message = archive.load().unwrap_err().to_string();
         assert!(message.contains("my scan.zip"), "{kept}: {message}");
-        let remedy = "pack the folder again, or unpack it and name the folder";
+        let remedy = "pack the folder again, or unpack the archive and give that folder instead";
         assert!(kept < 2 || message.contains(remedy), "{kept}: {message}");
     }
     let nothing = pack(&[], "", CompressionMethod::Stored);
@@ -276,7 +276,7 @@ fn damaged_archives_are_refused() {
 
 /// 65 MiB of zeros are compressed to about 64 KiB; the size that the archive states may be false.
 #[test]
-fn bombs_are_refused_before_they_fill_the_disk() {
+fn zip_bombs_are_refused_before_they_fill_the_disk() {
     let mut all = files(Made::colmap_txt().path());
     all.push(("images/zeros.png".to_owned(), vec![0; 65 << 20]));
     let bomb = pack(&all, "", CompressionMethod::Deflated);

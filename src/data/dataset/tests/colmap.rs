@@ -6,7 +6,7 @@ use super::super::*;
 use super::{assert_noted, load, load_with, names, refused};
 use densify_fixtures::{Made, SIZE, image};
 
-/// Copies a model, but only the first `images` of its images.
+/// Copies a model with only the first `images` of its images.
 fn copy(made: &Made, from: &str, to: &str, images: usize) {
     fs::create_dir_all(made.file(to)).unwrap();
     for entry in fs::read_dir(made.file(from)).unwrap() {
@@ -19,7 +19,7 @@ fn copy(made: &Made, from: &str, to: &str, images: usize) {
         let lines: Vec<&str> = text.lines().take(1 + 2 * images).collect();
         made.write(&file, lines.join("\n"));
     } else {
-        // Images have names of five letters and two observations.
+        // Each image has a name of five letters and two observations.
         made.patch(&format!("{to}/images.bin"), |bytes| {
             bytes[0] = images as u8;
             bytes.truncate(8 + images * (4 + 56 + 4 + 6 + 8 + 48));
@@ -47,7 +47,7 @@ fn the_largest_of_several_models_is_read() {
         let data = load_with(&made, &chosen);
         assert_eq!((names(&data.train), other_models(&data)), (vec!["a.png", "b.png"], None));
         assert_noted(&data, "sparse/2 has the poses of 2 of 3 images");
-        // Of models with equally many images the first is read, and no model needs the number 0.
+        // Of models with equally many images, the first is read; there need not be a model 0.
         fs::remove_dir_all(made.file("sparse/0")).unwrap();
         copy(&made, "sparse/10", "sparse/9", 3);
         let others = vec![("sparse/2".to_owned(), 2), ("sparse/10".to_owned(), 3)];
@@ -82,8 +82,8 @@ fn the_model_may_be_where_nerfstudio_puts_it() {
 #[test]
 fn a_model_may_have_no_points() {
     for made in [Made::colmap_txt(), Made::colmap_bin()] {
-        for ending in ["txt", "bin"] {
-            let _ = fs::remove_file(made.file(&format!("sparse/0/points3D.{ending}")));
+        for extension in ["txt", "bin"] {
+            let _ = fs::remove_file(made.file(&format!("sparse/0/points3D.{extension}")));
         }
         let tracks = LoadOptions { tracks: true, ..LoadOptions::default() };
         let data = load_with(&made, &tracks);

@@ -44,7 +44,7 @@ fn write_exif(path: &Path, fields: Vec<(Tag, Value)>) {
     std::fs::write(path, file).unwrap();
 }
 
-fn with(settings: [Option<Settings>; 3]) -> Made {
+fn shot(settings: [Option<Settings>; 3]) -> Made {
     let made = Made::colmap_txt();
     for (name, settings) in ["a", "b", "c"].into_iter().zip(settings) {
         if let Some(settings) = settings {
@@ -65,7 +65,7 @@ fn reported(made: &Made) -> ReportedExposures {
 #[test]
 fn exposures_are_reported_in_stops() {
     // The second has twice the time; the third has a quarter of it, half the f-number and twice the sensitivity.
-    let found = reported(&with([
+    let found = reported(&shot([
         Some(((1, 100), (4, 1), 100)),
         Some(((1, 50), (4, 1), 100)),
         Some(((10, 4000), (20, 10), 200)),
@@ -77,16 +77,16 @@ fn exposures_are_reported_in_stops() {
     }
     assert_eq!((found.implausible, found.example), (0, None));
     // Photographs without EXIF have no exposure.
-    let found = reported(&with([None, Some(((1, 50), (4, 1), 100)), None]));
+    let found = reported(&shot([None, Some(((1, 50), (4, 1), 100)), None]));
     assert!(found.stops[0].is_none() && found.stops[1].is_some() && found.stops[2].is_none());
     assert_eq!(found.implausible, 0);
 }
 
 /// JPEG files store EXIF in a segment of its own.
 #[test]
-fn exposures_are_read_from_other_formats_too() {
+fn exposures_are_read_from_jpeg_files_too() {
     let made = Made::transforms(|json| json["frames"][0]["file_path"] = "images/a.jpg".into());
-    let png = with([Some(((1, 50), (4, 1), 100)), None, None]);
+    let png = shot([Some(((1, 50), (4, 1), 100)), None, None]);
     let expected = reported(&png).stops[0];
     let bytes = std::fs::read(png.file("images/a.png")).unwrap();
     let length = u32::from_be_bytes(bytes[33..37].try_into().unwrap()) as usize;
@@ -126,7 +126,7 @@ fn implausible_values_are_named_and_not_used() {
         (((1, 50), (1000, 1), 100), "f/1000"),
         (((1, 50), (4, 1), 0), "ISO 0"),
     ] {
-        let found = reported(&with([Some(settings), Some(((1, 50), (4, 1), 100)), Some(settings)]));
+        let found = reported(&shot([Some(settings), Some(((1, 50), (4, 1), 100)), Some(settings)]));
         assert_eq!((found.implausible, found.stops[0], found.stops[2]), (2, None, None), "{words}");
         assert!(found.stops[1].is_some());
         let example = found.example.unwrap();
@@ -136,8 +136,8 @@ fn implausible_values_are_named_and_not_used() {
 
 /// With any byte of the EXIF damaged, the photograph is still read.
 #[test]
-fn damaged_exif_changes_nothing_else() {
-    let made = with([Some(((1, 50), (4, 1), 100)), None, None]);
+fn damaged_exif_does_not_prevent_loading() {
+    let made = shot([Some(((1, 50), (4, 1), 100)), None, None]);
     let path = made.file("images/a.png");
     let whole = std::fs::read(&path).unwrap();
     let length = u32::from_be_bytes(whole[33..37].try_into().unwrap()) as usize;
@@ -181,7 +181,7 @@ fn a_photograph_that_lies_on_its_side_compared_with_its_camera_is_turned() {
         assert_eq!((image.width, image.height), SIZE);
         assert_eq!(image.rgb[..3], left, "{orientation}");
         assert_ne!(image.rgb[57..60], left, "{orientation}");
-        assert_noted(&data, "lie on, 1 photograph, b.png");
+        assert_noted(&data, "1 photograph rotated by 90 degrees, b.png");
         // Turning needs memory for two copies of the image.
         let bytes = view.source.working_bytes();
         assert!(bytes >= 2 * 3 * u64::from(SIZE.0 * SIZE.1), "{bytes}");
@@ -193,7 +193,7 @@ fn a_photograph_that_lies_on_its_side_compared_with_its_camera_is_turned() {
     }
 }
 
-/// The size in the pose file decides: the orientation of an image that fits its camera is ignored.
+/// The image size in the pose file decides: the orientation of an image that fits its camera is ignored.
 #[test]
 fn a_photograph_that_fits_its_camera_is_not_turned() {
     let plain = Made::colmap_txt();
@@ -243,7 +243,7 @@ fn an_ambiguous_orientation_is_noted() {
     ] {
         write_exif(&made.file("images/b.png"), turned(6));
         let data = load(&made);
-        let is_noted = |note: &Note| note.contains("used as stored: 1 photograph whose");
+        let is_noted = |note: &Note| note.contains("1 photograph used as stored, although");
         assert_eq!(data.notes.iter().any(is_noted), is_named, "{:?}", data.notes);
     }
 }

@@ -130,7 +130,7 @@ fn frames_are_split_as_their_lists_say() {
     }
 }
 
-/// Lists may spell the paths of frames in any way, also of frames whose photograph is missing.
+/// Lists may spell the paths of frames in any way, even those of frames whose photograph is missing.
 #[test]
 fn lists_and_frames_may_spell_paths_differently() {
     let made = Made::transforms(|json| {
@@ -143,7 +143,7 @@ fn lists_and_frames_may_spell_paths_differently() {
     let data = load(&made);
     assert_eq!(data.train.len(), 2);
     assert_noted(&data, "1 of 3 frames have no image file");
-    // Paths of another machine.
+    // The paths may be those of another machine.
     let made = Made::transforms(|json| {
         json["frames"][1]["file_path"] = "/home/x/images/b.png".into();
         json["train_filenames"] = vec!["images/a.png", "C:\\x\\images\\b.png"].into();
@@ -188,7 +188,7 @@ fn images_are_loaded_at_the_requested_resolution() {
 }
 
 #[test]
-fn images_are_read_from_the_folder_that_is_named() {
+fn images_are_read_from_the_folder_that_the_options_name() {
     let elsewhere = tempfile::tempdir().unwrap();
     for made in [Made::colmap_txt(), Made::transforms(|_| ())] {
         for name in NAMES {
@@ -207,7 +207,7 @@ fn images_are_read_from_the_folder_that_is_named() {
 /// Transparent photographs are composited on the background in every format.
 #[test]
 fn transparency_is_the_same_in_every_format() {
-    for ending in ["png", "webp"] {
+    for extension in ["png", "webp"] {
         for (made, listing) in [
             (Made::colmap_txt(), "sparse/0/images.txt"),
             (Made::transforms(|_| ()), "transforms.json"),
@@ -215,7 +215,7 @@ fn transparency_is_the_same_in_every_format() {
         ] {
             for name in NAMES {
                 made.remove(&format!("images/{name}"));
-                let renamed = name.replace("png", ending);
+                let renamed = name.replace("png", extension);
                 made.replace(listing, name, &renamed);
                 let alpha = |x, _| image::Rgba([255, 102, 0, if x < 10 { 51 } else { 255 }]);
                 let image = image::RgbaImage::from_fn(SIZE.0, SIZE.1, alpha);
@@ -237,11 +237,11 @@ fn transparency_is_the_same_in_every_format() {
 }
 
 #[test]
-fn frames_override_the_intrinsics_at_the_top() {
+fn intrinsics_of_a_frame_override_those_at_the_top_level() {
     let data = load(&Made::transforms(|json| json["frames"][1]["fl_x"] = 12.0.into()));
     let fx: Vec<f64> = data.train.iter().map(|view| view.camera.fx).collect();
     assert_eq!(fx, [15.0, 12.0, 15.0]);
-    // NeRF-synthetic files only state a field of view.
+    // NeRF-synthetic files state only a field of view.
     let data = load(&Made::transforms(|json| {
         for field in ["w", "h", "fl_x", "fl_y", "cx", "cy"] {
             json.as_object_mut().unwrap().remove(field);
@@ -285,7 +285,7 @@ fn a_far_off_scene_keeps_its_precision() {
     let made = Made::colmap_txt();
     let data = load(&made);
     let far = Made::colmap_txt();
-    // All cameras and points moved by (1e6, 0, 0): t − R·offset.
+    // All cameras and points are moved by (1e6, 0, 0), so a translation t becomes t − R·offset.
     far.replace("sparse/0/images.txt", "1 0 0 0 0 0 4 ", "1 0 0 0 -1000000 0 4 ");
     far.replace("sparse/0/images.txt", "0.8 0 0.6 0 0.5 0 4 ", "0.8 0 0.6 0 -279999.5 0 960004 ");
     far.replace("sparse/0/images.txt", "0 0 1 0 0 0.25 5 ", "0 0 1 0 1000000 0.25 5 ");

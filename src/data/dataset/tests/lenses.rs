@@ -61,7 +61,7 @@ fn nerfstudio_and_colmap_lenses_agree() {
 
 #[test]
 fn views_of_one_photograph_share_its_file_and_split() {
-    // 191 by 115 degrees.
+    // The field of view is 191 by 115 degrees.
     let made = colmap("OPENCV_FISHEYE 20 12 6 6 10 6 0 0 0 0");
     let every = Split::Every(std::num::NonZeroU32::new(2).unwrap());
     let options = LoadOptions { split: every, tracks: true, ..LoadOptions::default() };

@@ -1,11 +1,11 @@
-//! Tests of where masks are found, and what they hide.
+//! Tests of the places where masks are found, and of what masks hide.
 
 use super::super::*;
 use super::{assert_noted, load, load_with, write_mask};
 use densify_fixtures::{Made, NAMES, SIZE, image};
 
 #[test]
-fn masks_are_found() {
+fn masks_are_found_under_all_usual_names() {
     for (made, mask) in [
         (Made::colmap_txt(), "masks/b.png.png"),
         (Made::colmap_txt(), "masks/b.png"),
@@ -74,7 +74,7 @@ fn dynamic_masks_are_found_beside_photographs() {
 
 /// Masks are in the dataset's `masks/` or beside the photographs, and are never taken for photographs.
 #[test]
-fn masks_are_found_in_the_folder_that_is_named() {
+fn masks_are_found_if_the_options_name_an_image_folder() {
     // Each mask is preferred to the following ones, and then removed.
     let masks = [
         "masks/b.png.png",

@@ -136,7 +136,7 @@ fn a_frame_without_intrinsics_is_named() {
 
 /// Programs write the paths of the machine that they ran on (RealityScan's `transforms.json`).
 #[test]
-fn paths_of_another_machine_are_found_in_the_folder_that_is_named() {
+fn paths_of_another_machine_are_found_in_the_folder_that_the_options_name() {
     let written = [r"C:\Users\me\walk\1\a.png", "/home/me/walk/2/b.png", "file:///home/me/c.png"];
     let made = Made::transforms(|json| {
         for (frame, path) in json["frames"].as_array_mut().unwrap().iter_mut().zip(written) {
@@ -248,7 +248,7 @@ fn two_paths_to_one_photograph_are_refused() {
         made.write(file, part.to_string());
     }
     refused("phones", &made, &options, words);
-    // In folders of their own they are different files.
+    // In separate folders they are different files.
     for path in ["moved/train/r_0.png", "moved/test/r_0.png"] {
         image(&made.file(path), (20, 12), 9);
     }
@@ -270,20 +270,20 @@ fn masks_and_points_of_another_machine_are_found_too() {
         made
     };
     let load = |made: &Made| load_with(made, &options);
-    let place = |data: &Dataset| data.test[0].source.mask.clone().unwrap().file.path;
+    let mask_path = |data: &Dataset| data.test[0].source.mask.clone().unwrap().file.path;
     let found = made();
     for path in ["masks/hidden.png", "masks/b.png", "hidden.png"] {
         image(&found.file(path), (20, 12), 255);
     }
     let data = load(&found);
     assert_eq!((data.train.len(), data.test.len(), data.points.len()), (2, 1, 200));
-    assert!(place(&data).ends_with("masks/hidden.png"));
+    assert!(mask_path(&data).ends_with("masks/hidden.png"));
     // Otherwise the mask is found by the photograph's name; a file of the mask's bare name may be a photograph.
     found.remove("masks/hidden.png");
-    assert!(place(&load(&found)).ends_with("masks/b.png"));
+    assert!(mask_path(&load(&found)).ends_with("masks/b.png"));
     found.remove("masks/b.png");
     refused("phones", &found, &options, "frames[1].mask_path, hidden.png, `masks/`");
-    // Points that were not copied along are left out.
+    // Points that were not copied with the photographs are left out.
     let without_points = made();
     image(&without_points.file("masks/b.png"), (20, 12), 255);
     without_points.remove("points.ply");

@@ -111,7 +111,7 @@ fn row<'a>(words: [u32; 4], bounds: &[f32], sh: &'a mut [f32]) -> Row<'a> {
     Row { mean, log_scale, quat: quaternion(rotation), opacity_logit, sh }
 }
 
-/// The lowest bits of a word as a fraction of the largest value they hold.
+/// The lowest `bits` bits of a word as a fraction of their largest value.
 fn share(word: u32, bits: u32) -> f32 {
     let most = (1u32 << bits) - 1;
     (word & most) as f32 / most as f32
@@ -122,7 +122,7 @@ fn three(word: u32) -> [f32; 3] {
     [share(word >> 21, 11), share(word >> 11, 10), share(word, 11)]
 }
 
-/// The largest component's index, and the three others from −1/√2 to 1/√2, in order (w, x, y, z).
+/// Decodes the index of the largest component, and the three others from −1/√2 to 1/√2, in the order (w, x, y, z).
 fn quaternion(word: u32) -> [f32; 4] {
     let small =
         [20, 10, 0].map(|shift| (share(word >> shift, 10) - 0.5) * std::f32::consts::SQRT_2);

@@ -1,7 +1,7 @@
 //! Writes compressed splat PLY.
 //!
-//! A coefficient is a byte that stands for a value between −4 and 4, but never for 0. Coefficients of 0, as in bands
-//! that were not trained, alternate between the two nearest values, so that the colour is right on average.
+//! A byte stands for a coefficient between −4 and 4, but never for 0. Coefficients of 0, as in bands that were not
+//! trained, alternate between the two nearest values, so that the colour is right on average.
 
 use std::io::{self, Write};
 
@@ -20,7 +20,7 @@ const PACKED: usize = 14;
 #[derive(Default)]
 pub(super) struct CompressedPlyWriter {
     /// Gaussians of the current chunk, which is not full.
-    open: Vec<[f32; PACKED]>,
+    current: Vec<[f32; PACKED]>,
     chunks: Vec<[f32; BOUNDS.len()]>,
     words: Vec<[u32; WORDS.len()]>,
     /// Channel by channel. Shape: `[rows, 3·coefficients]`.
@@ -32,8 +32,8 @@ impl ModelWriter for CompressedPlyWriter {
         let rest = 3 * (sh_coefficients(sh_degree) - 1);
         let row = size_of::<[u32; WORDS.len()]>() + rest;
         let chunk = size_of::<[f32; BOUNDS.len()]>();
-        let open = CHUNK * size_of::<[f32; PACKED]>();
-        (rows * row + rows.div_ceil(CHUNK) * chunk + open) as u64
+        let current = CHUNK * size_of::<[f32; PACKED]>();
+        (rows * row + rows.div_ceil(CHUNK) * chunk + current) as u64
     }
 
     fn wants_spatial_order(&self) -> bool {
@@ -47,7 +47,7 @@ impl ModelWriter for CompressedPlyWriter {
     fn begin(&mut self, shape: Shape, out: &mut dyn Write) -> io::Result<()> {
         let Shape { rows, sh_degree, antialiasing, frame } = shape;
         let rest = 3 * (sh_coefficients(sh_degree) - 1);
-        self.open.reserve_exact(CHUNK);
+        self.current.reserve_exact(CHUNK);
         self.chunks.reserve_exact(rows.div_ceil(CHUNK));
         self.words.reserve_exact(rows);
         self.bands.reserve_exact(rows * rest);
@@ -78,24 +78,24 @@ impl ModelWriter for CompressedPlyWriter {
             let [r, g, b] = [sh[0], sh[1], sh[2]].map(dc_to_rgb);
             let opacity = sigmoid(rows.opacity_logits[row]);
             let [s, t, u] = scale;
-            self.open.push([x, y, z, s, t, u, r, g, b, opacity, w, i, j, k]);
+            self.current.push([x, y, z, s, t, u, r, g, b, opacity, w, i, j, k]);
             for channel in 0..3 {
                 for &value in sh[3..].iter().skip(channel).step_by(3) {
-                    let place = self.open.len() + self.bands.len() % (sh.len() - 3);
-                    let byte = if value == 0.0 { 127 + (place % 2) as u8 } else { band(value) };
+                    let index = self.current.len() + self.bands.len() % (sh.len() - 3);
+                    let byte = if value == 0.0 { 127 + (index % 2) as u8 } else { band(value) };
                     self.bands.push(byte);
                 }
             }
-            if self.open.len() == CHUNK {
-                self.close();
+            if self.current.len() == CHUNK {
+                self.pack_chunk();
             }
         }
         Ok(())
     }
 
     fn finish(&mut self, out: &mut dyn Write) -> io::Result<()> {
-        if !self.open.is_empty() {
-            self.close();
+        if !self.current.is_empty() {
+            self.pack_chunk();
         }
         for value in self.chunks.as_flattened() {
             out.write_all(&value.to_le_bytes())?;
@@ -108,15 +108,15 @@ impl ModelWriter for CompressedPlyWriter {
 }
 
 impl CompressedPlyWriter {
-    /// Packs the open chunk.
-    fn close(&mut self) {
+    /// Packs the current chunk.
+    fn pack_chunk(&mut self) {
         let mut bounds = [0.0; BOUNDS.len()];
         for (axis, at) in (0..9).map(|axis| (axis, axis / 3 * 6 + axis % 3)) {
-            let values = || self.open.iter().map(|row| row[axis]);
+            let values = || self.current.iter().map(|row| row[axis]);
             bounds[at] = values().fold(f32::INFINITY, f32::min);
             bounds[at + 3] = values().fold(f32::NEG_INFINITY, f32::max);
         }
-        for row in &self.open {
+        for row in &self.current {
             let share = |axis: usize| {
                 let at = axis / 3 * 6 + axis % 3;
                 let (least, most) = (bounds[at], bounds[at + 3]);
@@ -131,7 +131,7 @@ impl CompressedPlyWriter {
             self.words.push([three(0), quaternion(quat), three(3), colour]);
         }
         self.chunks.push(bounds);
-        self.open.clear();
+        self.current.clear();
     }
 }
 

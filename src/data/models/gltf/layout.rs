@@ -4,8 +4,8 @@
 pub(super) const MAGIC: &[u8; 4] = b"glTF";
 /// The extension.
 pub(super) const SPLATS: &str = "KHR_gaussian_splatting";
-/// Logarithms of the scales, in an attribute of our own: they cannot be recovered bit for bit from the scales that the
-/// standard stores.
+/// Logarithms of the scales, in an attribute of densify's own: they cannot be recovered bit for bit from the scales
+/// that the standard stores.
 pub(super) const LOG_SCALE: &str = "_LOG_SCALE";
 /// Logits of the opacities, for the same reason.
 pub(super) const OPACITY_LOGIT: &str = "_OPACITY_LOGIT";

@@ -34,7 +34,7 @@ impl Node {
     }
 }
 
-/// The meshes below the roots, or of all nodes if there are no roots, each with its transform into the frame of the
+/// The meshes below the roots, or of all nodes if no roots are given, each with its transform into the frame of the
 /// other formats.
 pub(super) fn placed_meshes(
     path: &Path,
@@ -44,10 +44,10 @@ pub(super) fn placed_meshes(
     let wrong = |problem: &str| LoadError::damaged(path, "nodes", problem);
     let to_our_frame = DMat4::from_quat(DQuat::from_array(HALF_TURN));
     let every: Vec<usize> = (0..nodes.len()).collect();
-    let mut open: Vec<(usize, DMat4)> =
+    let mut stack: Vec<(usize, DMat4)> =
         roots.unwrap_or(&every).iter().rev().map(|&node| (node, to_our_frame)).collect();
     let (mut placed, mut seen) = (Vec::new(), vec![false; nodes.len()]);
-    while let Some((index, parent)) = open.pop() {
+    while let Some((index, parent)) = stack.pop() {
         let node = nodes.get(index).ok_or_else(|| wrong("there is no such node"))?;
         if std::mem::replace(&mut seen[index], true) {
             return Err(wrong("two nodes contain the same node, or nodes contain each other"));
@@ -60,7 +60,7 @@ pub(super) fn placed_meshes(
             placed.push((mesh, transform));
         }
         if roots.is_some() {
-            open.extend(node.children.iter().rev().map(|&child| (child, matrix)));
+            stack.extend(node.children.iter().rev().map(|&child| (child, matrix)));
         }
     }
     Ok(placed)

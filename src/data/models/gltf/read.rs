@@ -19,7 +19,7 @@ use crate::models::{siblings, spz};
 use densify_core::files::max_unpacked_bytes;
 use densify_core::gaussians::{MAX_SH_DEGREE, sh_coefficients, sigmoid};
 
-/// The extension of splats in SPZ.
+/// The extension for splats in SPZ.
 const SPZ: &str = "KHR_gaussian_splatting_compression_spz_2";
 /// Extensions that a file may require: the extensions of splats, and extensions without effect on splats.
 const KNOWN: [&str; 4] = [SPLATS, SPZ, "KHR_materials_unlit", "KHR_mesh_quantization"];
@@ -39,7 +39,7 @@ struct Document {
     nodes: Vec<nodes::Node>,
     scenes: Vec<Scene>,
     scene: usize,
-    /// Free for programs; densify states the antialiasing there.
+    /// Data of the program that wrote the file; densify states the antialiasing there.
     extras: Value,
 }
 
@@ -137,7 +137,7 @@ fn read(
         views: &document.buffer_views,
         buffers: contents,
     };
-    let mut found = SplatFile::default();
+    let mut whole = SplatFile::default();
     let mut primitives = 0;
     let roots = document.scenes.get(document.scene).map(|scene| scene.nodes.as_slice());
     for (mesh, transform) in nodes::placed_meshes(path, &document.nodes, roots)? {
@@ -147,10 +147,10 @@ fn read(
             primitives += 1;
             let mut part = splats(&buffers, primitive, extension)?;
             transform.apply(&mut part.gaussians);
-            join(path, &mut found, part)?;
-            // Many nodes may show the same data.
+            join(path, &mut whole, part)?;
+            // Many nodes may show the same data, which could exhaust the memory.
             let bytes =
-                4 * (11 + found.gaussians.sh.len() as u64 + 11 * found.gaussians.len() as u64);
+                4 * (11 + whole.gaussians.sh.len() as u64 + 11 * whole.gaussians.len() as u64);
             if bytes > max_unpacked_bytes(total) {
                 let problem = "they show more splats than a file of this size can hold";
                 return Err(LoadError::damaged(path, "nodes", problem));
@@ -164,9 +164,9 @@ fn read(
         )));
     }
     if let Some(stated) = stated_in_json(path, "extras", &document.extras)? {
-        found.gaussians.antialiasing = stated;
+        whole.gaussians.antialiasing = stated;
     }
-    Ok(found)
+    Ok(whole)
 }
 
 /// The bytes of a buffer outside the binary chunk.
@@ -193,7 +193,7 @@ fn splats(
         let bytes = buffers.view(view.unwrap_or(usize::MAX))?;
         let (mut file, axes) = spz::read::read_as_stored(path, bytes, bytes.len() as u64)?;
         let ignored =
-            axes.map(|axes| format!("its SPZ states the axes {axes}; those of glTF count"));
+            axes.map(|axes| format!("its SPZ states the axes {axes}, which glTF overrides"));
         file.notes.extend(ignored);
         return Ok(file);
     }
@@ -270,10 +270,10 @@ fn splats(
     rows.finish(path)
 }
 
-/// Appends a part; the result has the higher of both degrees.
+/// Appends a part; the result has the higher of the two degrees.
 ///
 /// # Errors
-/// When the parts, as SPZ inside glTF, state different antialiasing.
+/// When the parts state different antialiasing, as SPZ inside glTF may.
 fn join(path: &Path, whole: &mut SplatFile, part: SplatFile) -> Result<(), LoadError> {
     let is_first = whole.gaussians.is_empty();
     if is_first {

@@ -66,7 +66,7 @@ fn logarithms_and_logits_are_refused_with_the_reason() {
         std::fs::write(&path, document.to_string()).unwrap();
         read_model(&path).map(|file| file.gaussians).map_err(|error| error.to_string())
     };
-    // Rounding may lead to opacities above 1.
+    // Rounding may lead to opacities slightly above 1.
     for (scale, opacity) in [(0.2, 0.9), (0.0, 0.0), (80.0, 1.0), (0.2, 1.000_001)] {
         assert_eq!(read(scale, opacity).map(|model| model.len()), Ok(1), "{scale}, {opacity}");
     }

@@ -1,4 +1,4 @@
-//! Writes binary glTF 2.0 in f32, with log-scales and opacity logits as further attributes, which other programs
+//! Writes binary glTF 2.0 in f32, with log-scales and opacity logits as additional attributes, which other programs
 //! ignore. The node holds the half turn from the dataset's frame into that of glTF.
 
 use std::io::{self, Write};

@@ -6,13 +6,13 @@ use crate::models::spatial_order::middles_and_spreads;
 use densify_core::gaussians::Gaussians;
 
 /// Whatever the scales are, numbers from 0 to 1 count as opacities if the largest is above this and they spread by more
-/// than [`SPREAD`]. As logits, 0.9 to 1 would be opacities of 0.71 to 0.73.
+/// than [`SPREAD`]. As logits, 0.9 to 1 would mean opacities of 0.71 to 0.73.
 const NEAR_OPAQUE: f32 = 0.9;
-/// Smallest spread of numbers that count as opacities. As logits, 0 to 1 would be opacities of 0.5 to 0.73.
+/// Smallest spread of numbers that count as opacities. As logits, 0 to 1 would mean opacities of 0.5 to 0.73.
 const SPREAD: f32 = 0.25;
 
 /// Turns plain values into logits and logarithms where there is no doubt; returns notes on these values, and on
-/// values that are in doubt.
+/// doubtful ones.
 pub(super) fn undo(model: &mut Gaussians) -> Vec<String> {
     let (faintest, most_opaque) = range(&model.opacity_logits);
     let (least, most) = range(model.log_scales.as_flattened());
@@ -42,7 +42,7 @@ pub(super) fn undo(model: &mut Gaussians) -> Vec<String> {
     } else if are_scales {
         notes.push(format!(
             "its scales may be standard deviations instead of logarithms: none is negative, so every Gaussian is read as \
-             larger than {:.3}; if they are, export their logarithms",
+             larger than {:.3}; if they are standard deviations, export their logarithms",
             least.exp()
         ));
     }

@@ -33,7 +33,7 @@ pub(crate) const OFFSET: &str = "densify offset";
 /// are exact in f32.
 pub(super) const NEAR: &str = "densify near";
 
-/// Index of the normals among the [`properties`].
+/// Number of [`properties`] before the normals.
 pub(super) const NORMALS_AT: usize = 3;
 
 /// The degree with as many coefficients above band 0 as an element has `f_rest_*` properties.

@@ -73,8 +73,8 @@ pub(super) fn read(path: &Path) -> Result<SplatFile, LoadError> {
             // Subtracting 0 keeps the sign of −0.
             *value = (wide - origin) as f32;
         }
-        let own = if filter.is_some() { fuse_filter(&mut values) } else { &values };
-        push(&mut rows, own, &mut sh, rest);
+        let fused = if filter.is_some() { fuse_filter(&mut values) } else { &values };
+        push(&mut rows, fused, &mut sh, rest);
     })?;
     let mut file = rows.finish(path)?;
     file.gaussians.origin = offset.unwrap_or(origin);
@@ -92,7 +92,7 @@ pub(super) fn read(path: &Path) -> Result<SplatFile, LoadError> {
     Ok(file)
 }
 
-/// The point from which positions in f64 are measured, so that f32 holds them: 0 unless they are far from it.
+/// The point from which positions in f64 are measured, so that f32 can hold them; 0 unless they are far from 0.
 fn origin_of(path: &Path, vertices: &Element, columns: &[usize]) -> Result<[f64; 3], LoadError> {
     let mut axes = [const { Vec::new() }; 3];
     Ply::open(path)?.each_row(vertices, columns, |row| {
@@ -106,8 +106,8 @@ fn origin_of(path: &Path, vertices: &Element, columns: &[usize]) -> Result<[f64;
 /// The property that holds the radius f of Mip-Splatting's 3D filter `[scene units]`.
 const FILTER: &str = "filter_3D";
 
-/// Fuses the 3D filter, the last of a Gaussian's values, into its scales s and its opacity o: s′ = √(s² + f²) and
-/// o′ = o·√(Πs²/Πs′²) (Mip-Splatting, equation 7 and `gaussian_model.py`). Returns the values without it.
+/// Fuses the 3D filter, the last of a Gaussian's values, into its scales s and its opacity o: s′ = √(s² + f²) and o′ =
+/// o·√(Πs²/Πs′²) (Mip-Splatting, equation 7 and `gaussian_model.py`). Returns the values without the filter.
 fn fuse_filter(values: &mut [f32]) -> &[f32] {
     let [own @ .., filter] = values else { unreachable!("a row ends with its filter") };
     let at = own.len() - 8;
@@ -126,7 +126,7 @@ fn fuse_filter(values: &mut [f32]) -> &[f32] {
     own
 }
 
-/// Adds a Gaussian with these [`properties`]. `sh` is scratch.
+/// Adds a Gaussian with these [`properties`]. `sh` is a buffer that is reused.
 fn push(rows: &mut Rows, values: &[f32], sh: &mut Vec<f32>, rest: usize) {
     let (position, values) = values.split_at(3);
     let (dc, values) = values.split_at(3);

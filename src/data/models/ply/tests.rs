@@ -84,7 +84,7 @@ fn infinite_opacities_and_flat_gaussians_are_read() {
     assert!(found.gaussians.log_scales[2][1].to_bits() == (-20f32).to_bits());
 }
 
-/// Programs that leave out the logit, the logarithm, or both, or that have one opacity for all.
+/// Some programs leave out the logit, the logarithm, or both, or write one size or one opacity for all Gaussians.
 #[test]
 fn activated_values_are_recognised() {
     let mut model = model(200, 0);
@@ -217,7 +217,7 @@ fn shared_splats_of_other_programs_load() {
         assert!(file.gaussians.len() >= 3 && file.dropped == 0, "{}", path.display());
         if path.ends_with("train-1000.ply") {
             assert_eq!((file.gaussians.len(), file.gaussians.sh_degree), (1000, 3));
-            // We write the layout of the original implementation, byte for byte.
+            // The written file is that of the original implementation, byte for byte.
             assert!(written(PLY, &file.gaussians).unwrap() == std::fs::read(&path).unwrap());
         }
     }

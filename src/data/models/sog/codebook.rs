@@ -2,7 +2,7 @@
 
 use super::layout::CODEBOOK as ENTRIES;
 
-/// Intervals of the histogram.
+/// Number of intervals of the histogram.
 const BINS: usize = 1 << 14;
 /// Maximum number of iterations; from this starting point, few are usually needed.
 const ITERATIONS: usize = 50;

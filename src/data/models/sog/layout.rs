@@ -5,13 +5,13 @@
 
 /// The file that describes the images.
 pub(super) const META: &str = "meta.json";
-/// Key of the offset of local coordinates in the `asset` of `meta.json`: densify's own.
+/// Key of the offset of local coordinates in the `asset` of `meta.json`, which only densify writes.
 pub(super) const OFFSET: &str = "offset";
 /// The `model` in `meta.json` of a model with antialiasing.
 pub(super) const ANTIALIASED: &str = "antialiased";
 /// Palette entries per row of its image.
 pub(super) const PALETTE_WIDTH: usize = 64;
-/// Numbers in a codebook.
+/// Number of values in a codebook.
 pub(super) const CODEBOOK: usize = 256;
 /// Alpha of a quaternion whose first component is the largest; the next values name the other components.
 pub(super) const FIRST_LARGEST: u8 = 252;

@@ -9,13 +9,13 @@ use std::collections::BinaryHeap;
 
 use Predictor::{Above, Left, Mean, Select};
 
-/// Symbols of each channel's code; green shares its code with the lengths of references, which are not used.
+/// Number of symbols in each channel's code; green shares its code with the lengths of references, which are not used.
 const SYMBOLS: [usize; 4] = [280, 256, 256, 256];
-/// Symbols of the code of distances.
+/// Number of symbols in the code of distances.
 const DISTANCES: usize = 40;
 /// Channels of RGBA in the order of their codes.
 const CHANNELS: [usize; 4] = [1, 0, 2, 3];
-/// Longest code word.
+/// Length of the longest code word `[bits]`.
 const MAX_BITS: u8 = 15;
 /// Order in which the code of lengths stores its own lengths.
 const LENGTH_ORDER: [usize; 19] =
@@ -38,15 +38,15 @@ struct Transforms {
     predictor: Option<Predictor>,
 }
 
-/// A stream of bits, the lowest first.
+/// Writes a stream of bits, the lowest first.
 #[derive(Default)]
-struct Bits {
+struct BitWriter {
     bytes: Vec<u8>,
     pending: u64,
     count: u32,
 }
 
-impl Bits {
+impl BitWriter {
     fn put(&mut self, value: u64, bits: u8) {
         self.pending |= value << self.count;
         self.count += u32::from(bits);
@@ -82,7 +82,7 @@ pub(super) fn encode(rgba: &[u8], (width, height): (usize, usize)) -> Vec<u8> {
     let none = Transforms { subtracts_green: false, predictor: None };
     let transforms = best.map_or(none, |(_, transforms)| transforms);
 
-    let mut to = Bits::default();
+    let mut to = BitWriter::default();
     to.put(0x2f, 8);
     to.put(width as u64 - 1, 14);
     to.put(height as u64 - 1, 14);
@@ -130,8 +130,8 @@ fn riff_file(data: &[u8]) -> Vec<u8> {
 
 /// The pixels after the transforms.
 fn residuals(pixels: &[[u8; 4]], width: usize, transforms: Transforms) -> Vec<[u8; 4]> {
-    let at = |place: usize| {
-        let [r, g, b, a] = pixels[place];
+    let at = |index: usize| {
+        let [r, g, b, a] = pixels[index];
         if transforms.subtracts_green {
             [r.wrapping_sub(g), g, b.wrapping_sub(g), a]
         } else {
@@ -141,12 +141,12 @@ fn residuals(pixels: &[[u8; 4]], width: usize, transforms: Transforms) -> Vec<[u
     let Some(predictor) = transforms.predictor else {
         return (0..pixels.len()).map(at).collect();
     };
-    let predicted = |place: usize| match (place % width, place / width) {
+    let predicted = |index: usize| match (index % width, index / width) {
         (0, 0) => [0, 0, 0, 255],
-        (_, 0) => at(place - 1),
-        (0, _) => at(place - width),
+        (_, 0) => at(index - 1),
+        (0, _) => at(index - width),
         _ => {
-            let (left, above) = (at(place - 1), at(place - width));
+            let (left, above) = (at(index - 1), at(index - width));
             match predictor {
                 Left => left,
                 Above => above,
@@ -154,7 +154,7 @@ fn residuals(pixels: &[[u8; 4]], width: usize, transforms: Transforms) -> Vec<[u
                     std::array::from_fn(|i| ((u16::from(left[i]) + u16::from(above[i])) / 2) as u8)
                 }
                 Select => {
-                    let corner = at(place - width - 1);
+                    let corner = at(index - width - 1);
                     let distance = |pixel: &[u8; 4]| -> u32 {
                         pixel.iter().zip(corner).map(|(a, b)| u32::from(a.abs_diff(b))).sum()
                     };
@@ -163,8 +163,8 @@ fn residuals(pixels: &[[u8; 4]], width: usize, transforms: Transforms) -> Vec<[u
             }
         }
     };
-    let residual = |place: usize| {
-        let (pixel, predicted) = (at(place), predicted(place));
+    let residual = |index: usize| {
+        let (pixel, predicted) = (at(index), predicted(index));
         std::array::from_fn(|i| pixel[i].wrapping_sub(predicted[i]))
     };
     (0..pixels.len()).map(residual).collect()
@@ -189,14 +189,14 @@ fn entropy(counts: &[u32]) -> f64 {
 }
 
 /// Writes a code with one symbol, whose code word has no bits.
-fn put_single(to: &mut Bits, symbol: u8) {
+fn put_single(to: &mut BitWriter, symbol: u8) {
     // A simple code with one symbol of eight bits.
     to.put(0b101, 3);
     to.put(symbol.into(), 8);
 }
 
 /// Writes a code for values with these counts; returns the bits and the length of each code word.
-fn put_code(to: &mut Bits, counts: &[u32], symbols: usize) -> Vec<(u16, u8)> {
+fn put_code(to: &mut BitWriter, counts: &[u32], symbols: usize) -> Vec<(u16, u8)> {
     let used: Vec<usize> = (0..counts.len()).filter(|&symbol| counts[symbol] > 0).collect();
     if let [] | [_] = used[..] {
         put_single(to, used.first().map_or(0, |&symbol| symbol as u8));
@@ -210,7 +210,7 @@ fn put_code(to: &mut Bits, counts: &[u32], symbols: usize) -> Vec<(u16, u8)> {
 }
 
 /// Writes the lengths of a code's words, which are themselves coded, with runs of zeros.
-fn put_lengths(to: &mut Bits, lengths: &[u8]) {
+fn put_lengths(to: &mut BitWriter, lengths: &[u8]) {
     // A symbol, then its extra bits and their number.
     let mut tokens: Vec<(usize, u64, u8)> = Vec::new();
     let mut rest = lengths;
@@ -245,13 +245,13 @@ fn put_lengths(to: &mut Bits, lengths: &[u8]) {
     }
 }
 
-/// The lengths of a Huffman code (1952) with words of at most `most` bits; 0 for values that do not occur. The counts
-/// are flattened until no word is too long.
-fn code_lengths(counts: &[u32], most: u8) -> Vec<u8> {
+/// The lengths of a Huffman code (1952) with words of at most `max_bits` bits; 0 for values that do not occur. The
+/// counts are flattened until no word is too long.
+fn code_lengths(counts: &[u32], max_bits: u8) -> Vec<u8> {
     let mut counts = counts.to_vec();
     loop {
         let lengths = huffman(&counts);
-        if lengths.iter().all(|length| *length <= most) {
+        if lengths.iter().all(|length| *length <= max_bits) {
             return lengths;
         }
         for count in counts.iter_mut().filter(|count| **count > 0) {

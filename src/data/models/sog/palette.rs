@@ -6,7 +6,7 @@
 use std::cmp::Ordering;
 use std::collections::BinaryHeap;
 
-/// Iterations per halving.
+/// Maximum number of iterations per halving.
 const ITERATIONS: usize = 4;
 
 /// A palette, and the index of each row's entry.
@@ -56,15 +56,15 @@ impl Palette {
         let mut clusters = clusters.into_vec();
         clusters.sort_by_key(|cluster| cluster.start);
         let mut labels = vec![0; order.len()];
-        let mut found = Vec::with_capacity(clusters.len() * width);
+        let mut means = Vec::with_capacity(clusters.len() * width);
         for (label, cluster) in clusters.iter().enumerate() {
             let rows = &order[cluster.start..cluster.end];
-            found.extend(all.mean(rows).into_iter().map(|value| value as f32));
+            means.extend(all.mean(rows).into_iter().map(|value| value as f32));
             for &row in rows {
                 labels[row as usize] = label as u32;
             }
         }
-        Self { entries: found, labels }
+        Self { entries: means, labels }
     }
 }
 
@@ -202,7 +202,7 @@ mod tests {
     }
 
     #[test]
-    fn as_many_entries_as_rows_lose_nothing_and_equal_rows_need_one() {
+    fn a_palette_with_an_entry_per_row_is_exact_and_equal_rows_share_one() {
         let values = corners();
         let all = Palette::fit(&values, 2, &[1.0; 400], 1000);
         for (row, &label) in all.labels.iter().enumerate() {

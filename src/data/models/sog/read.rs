@@ -93,8 +93,8 @@ type OpenImage<'a> = &'a mut dyn FnMut(&str) -> Result<Vec<u8>, LoadError>;
 
 /// True if a JSON text describes a model in this format, of any version.
 pub(super) fn is_meta(text: &str) -> bool {
-    let found: Option<serde_json::Map<String, serde_json::Value>> = serde_json::from_str(text).ok();
-    found.is_some_and(|keys| ["means", "quats"].iter().all(|key| keys.contains_key(*key)))
+    let json: Option<serde_json::Map<String, serde_json::Value>> = serde_json::from_str(text).ok();
+    json.is_some_and(|keys| ["means", "quats"].iter().all(|key| keys.contains_key(*key)))
 }
 
 /// Reads an archive, or the images beside `meta.json`.
@@ -160,12 +160,12 @@ fn read_images(
         decode(path, name, &open(name)?, length)
     };
     let mut image_of = |quantity: &Quantity, index: usize, field: &str| {
-        let found = picture(quantity, index, field)?;
-        if (found.rgba.len() as u64) / 4 < meta.count {
-            let problem = format!("{} pixels for {} Gaussians", found.rgba.len() / 4, meta.count);
+        let decoded = picture(quantity, index, field)?;
+        if (decoded.rgba.len() as u64) / 4 < meta.count {
+            let problem = format!("{} pixels for {} Gaussians", decoded.rgba.len() / 4, meta.count);
             return Err(LoadError::damaged(path, field, problem));
         }
-        Ok(found.rgba)
+        Ok(decoded.rgba)
     };
     let (low, high) = (image_of(&meta.means, 0, "means")?, image_of(&meta.means, 1, "means")?);
     let quats = image_of(&meta.quats, 0, "quats")?;

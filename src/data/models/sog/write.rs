@@ -113,13 +113,13 @@ impl ModelWriter for SogWriter {
         };
         let mins = [0, 1, 2].map(|axis| bound(axis, f32::INFINITY, f32::min));
         let maxs = [0, 1, 2].map(|axis| bound(axis, f32::NEG_INFINITY, f32::max));
-        let place = |row: usize, axis: usize| {
+        let level = |row: usize, axis: usize| {
             let extent = f64::from(maxs[axis]) - f64::from(mins[axis]);
             let share = f64::from(log(self.means[row][axis]) - mins[axis]) / extent.max(1e-30);
             (65_535.0 * share).round() as u16
         };
         for (name, shift) in [("means_l.webp", 0), ("means_u.webp", 8)] {
-            let byte = |row: usize, axis| (place(row, axis) >> shift) as u8;
+            let byte = |row: usize, axis| (level(row, axis) >> shift) as u8;
             let pixel = |row| [byte(row, 0), byte(row, 1), byte(row, 2), 255];
             archive.add(name, &picture().fill(rows, pixel).encode()?)?;
         }

@@ -14,8 +14,8 @@ use densify_core::gaussians::rgb_to_dc;
 
 /// Size of a Gaussian `[bytes]`.
 const ROW: usize = 32;
-/// Larger positions or standard deviations show that a file has another format.
-const PLAUSIBLE: f32 = 1e9;
+/// Largest plausible coordinate or standard deviation; larger ones show that a file has another format.
+const MAX_PLAUSIBLE: f32 = 1e9;
 
 /// True if the first bytes and the length of a file could be those of this format.
 pub(super) fn is_plausible(start: &[u8], length: u64) -> bool {
@@ -25,8 +25,8 @@ pub(super) fn is_plausible(start: &[u8], length: u64) -> bool {
         // Neither zeros nor the header of another format contain a unit quaternion here.
         let length = quaternion(row).map(|v| v * v).iter().sum::<f32>();
         (0.5..1.5).contains(&length)
-            && [x, y, z].iter().all(|v| v.abs() < PLAUSIBLE)
-            && scales.iter().all(|v| (0.0..PLAUSIBLE).contains(v))
+            && [x, y, z].iter().all(|v| v.abs() < MAX_PLAUSIBLE)
+            && scales.iter().all(|v| (0.0..MAX_PLAUSIBLE).contains(v))
     };
     length.is_multiple_of(ROW as u64) && !rows.is_empty() && rows.iter().all(plausible)
 }
@@ -40,8 +40,8 @@ pub(super) fn read(path: &Path, mut input: impl Read) -> Result<SplatFile, LoadE
     let mut bytes = Vec::new();
     loop {
         bytes.clear();
-        let found = (&mut input).take((ROW << 12) as u64).read_to_end(&mut bytes);
-        found.map_err(|source| unpack::read_error(path, "rows", source))?;
+        let read = (&mut input).take((ROW << 12) as u64).read_to_end(&mut bytes);
+        read.map_err(|source| unpack::read_error(path, "rows", source))?;
         for row in bytes.as_chunks::<ROW>().0 {
             let [x, y, z, s0, s1, s2] = floats(row);
             let colour = [row[24], row[25], row[26]].map(|v| rgb_to_dc(f32::from(v) / 255.0));

@@ -1,4 +1,4 @@
-//! Compresses the arrays of an SPZ file: in one gzip stream (version 3), or in a zstd frame each (version 4).
+//! Compresses the arrays of an SPZ file: all in one gzip stream (version 3), or each in a zstd frame (version 4).
 
 use std::io::{self, Write};
 
@@ -11,9 +11,9 @@ use super::layout::{HEADER_OF_VERSION_4, MAGIC};
 /// An array over all Gaussians: its size `[bytes]`, and a function that writes it.
 pub(super) type Array<'a> = (usize, &'a dyn Fn(&mut dyn Write) -> io::Result<()>);
 
-/// Upper bound on the memory of the gzip encoder, with its window, tables and buffer `[bytes]`: measured 0.35 MiB.
+/// Upper bound on the memory of the gzip encoder, with its window, tables and buffer `[bytes]`; 0.35 MiB were measured.
 pub(super) const GZIP_MEMORY: u64 = 1 << 19;
-/// The same for zstd: the current and the previous block of 128 KiB, each with a table of its strings.
+/// The same for zstd `[bytes]`: the current and the previous block of 128 KiB, each with a table of its strings.
 const ZSTD_MEMORY: u64 = 4 << 20;
 
 /// Upper bound on the memory that [`write_frames`] takes for arrays of these sizes `[bytes]`: all frames, and the

@@ -1,7 +1,7 @@
-//! The extensions of an SPZ file, of which the one that states the axes is read (`SPZ_ADOBE_coordinate_system`).
+//! The extensions of an SPZ file. Only `SPZ_ADOBE_coordinate_system` is read, which states the axes.
 //!
-//! Each is a record of type, length and content. They stand before the table of version 4, and after the arrays of
-//! earlier versions, if a bit of the header says so.
+//! Each extension is a record of type, length and content. Records stand before the table of version 4, and after the
+//! arrays of earlier versions, if a bit of the header says so.
 
 use std::path::Path;
 
@@ -12,8 +12,8 @@ use crate::error::LoadError;
 use crate::models::similarity::{Similarity, mirror_x};
 use densify_core::gaussians::Gaussians;
 
-/// The directions of the axes x, y, z (left, right, up, down, forwards, backwards), by their number in files, which
-/// counts from 1.
+/// The directions of the axes x, y, z (left, right, up, down, forwards, backwards), by their number in files, counted
+/// from 1.
 const SYSTEMS: [&str; 16] = [
     "LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF", "LFD", "RFD", "LFU", "RFU", "LBD",
     "RBD", "LBU", "RBU",
@@ -23,11 +23,11 @@ const SYSTEMS: [&str; 16] = [
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(in crate::models) struct Axes(&'static str);
 
-/// What the extensions of a file say.
+/// The contents of a file's extensions.
 #[derive(Debug, Default)]
 pub(super) struct Extensions {
     pub(super) axes: Option<Axes>,
-    /// Notes on what is ignored.
+    /// Notes on extensions that are ignored or damaged.
     pub(super) notes: Vec<String>,
 }
 
@@ -67,21 +67,21 @@ impl std::fmt::Display for Axes {
 /// # Errors
 /// When the stated axes are unknown.
 pub(super) fn parse(path: &Path, mut records: &[u8]) -> Result<Extensions, LoadError> {
-    let mut found = Extensions::default();
+    let mut extensions = Extensions::default();
     while !records.is_empty() {
         let Some((kind, content, rest)) = split_record(records) else {
-            found.notes.push("extensions are damaged, and the rest of them is ignored".into());
+            extensions.notes.push("a damaged extension and those after it are ignored".into());
             break;
         };
         records = rest;
         if kind != COORDINATE_SYSTEM {
-            found.notes.push(format!("the extension 0x{kind:08X} is ignored"));
+            extensions.notes.push(format!("the extension 0x{kind:08X} is ignored"));
             continue;
         }
         let number = content.first_chunk().map(|&bytes| u32::from_le_bytes(bytes));
-        found.axes = match number {
+        extensions.axes = match number {
             Some(0) => {
-                found.notes.push("the file says that its axes are unspecified".into());
+                extensions.notes.push("the file says that its axes are unspecified".into());
                 None
             }
             Some(number) if number as usize <= SYSTEMS.len() => {
@@ -94,7 +94,7 @@ pub(super) fn parse(path: &Path, mut records: &[u8]) -> Result<Extensions, LoadE
             }
         };
     }
-    Ok(found)
+    Ok(extensions)
 }
 
 /// The type and the content of the first record, and the records after it; `None` if it is truncated.
@@ -120,8 +120,8 @@ mod tests {
         [&kind.to_le_bytes()[..], &(content.len() as u32).to_le_bytes(), content].concat()
     }
 
-    /// The corpus file of a version with extensions, which its header states.
-    fn with(version: u32, records: &[u8]) -> Vec<u8> {
+    /// The corpus file of a version, with these records of extensions.
+    fn spz(version: u32, records: &[u8]) -> Vec<u8> {
         let mut bytes = std::fs::read(corpus(&format!("spz/v{version}.spz"))).unwrap();
         if version == 4 {
             bytes[14] |= 2;
@@ -139,7 +139,7 @@ mod tests {
     }
 
     #[test]
-    fn models_are_converted_from_the_axes_that_are_stated() {
+    fn models_are_converted_from_the_stated_axes() {
         for version in [3, 4] {
             let plain = read_model(&corpus(&format!("spz/v{version}.spz"))).unwrap();
             type Turn = fn([f32; 3]) -> [f32; 3];
@@ -152,7 +152,7 @@ mod tests {
             ];
             for (number, mean) in cases {
                 let stated = record(COORDINATE_SYSTEM, &number.to_le_bytes());
-                let (_folder, path) = saved("model.bin", with(version, &stated));
+                let (_folder, path) = saved("model.bin", spz(version, &stated));
                 let found = read_model(&path).unwrap();
                 for (found, plain) in found.gaussians.means.iter().zip(&plain.gaussians.means) {
                     let apart = found.iter().zip(mean(*plain)).map(|(a, b)| (a - b).abs());
@@ -165,7 +165,7 @@ mod tests {
 
     #[test]
     fn axes_and_antialiasing_may_both_be_stated() {
-        let mut bytes = with(4, &record(COORDINATE_SYSTEM, &4_u32.to_le_bytes()));
+        let mut bytes = spz(4, &record(COORDINATE_SYSTEM, &4_u32.to_le_bytes()));
         bytes[14] |= ANTIALIASED;
         let (_folder, path) = saved("model.bin", bytes);
         let found = read_model(&path).unwrap();
@@ -175,7 +175,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_read_is_noted_or_refused() {
+    fn unknown_extensions_are_noted_and_unknown_axes_refused() {
         let plain = read_model(&corpus("spz/v4.spz")).unwrap().gaussians;
         let unspecified = record(COORDINATE_SYSTEM, &[0; 4]);
         let other = record(0xadbe_0002, &[1; 12]);
@@ -184,13 +184,13 @@ mod tests {
             (&other, "0xADBE0002"),
             (&other[..9].to_vec(), "damaged"),
         ] {
-            let (_folder, path) = saved("model.bin", with(4, records));
+            let (_folder, path) = saved("model.bin", spz(4, records));
             let found = read_model(&path).unwrap();
             assert_eq!(found.gaussians, plain, "{words}");
             assert!(found.notes[0].contains(words), "{words}: {:?}", found.notes);
         }
         for content in [&[17, 0, 0, 0][..], &[4]] {
-            let (_folder, path) = saved("model.bin", with(4, &record(COORDINATE_SYSTEM, content)));
+            let (_folder, path) = saved("model.bin", spz(4, &record(COORDINATE_SYSTEM, content)));
             let message = read_model(&path).unwrap_err().to_string();
             assert!(message.contains("model.bin: SPZ_ADOBE_coordinate_system"), "{message}");
         }

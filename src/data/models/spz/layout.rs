@@ -5,9 +5,9 @@
 
 /// First word of the data, `NGSP` in little endian.
 pub(super) const MAGIC: u32 = 0x5053_474e;
-/// The bit of the header's flags, byte 14, of a model trained with antialiasing (`load-spz.cc`).
+/// The bit of the header's flags (byte 14) that marks a model trained with antialiasing (`load-spz.cc`).
 pub(super) const ANTIALIASED: u8 = 1;
-/// The bit of the same flags that says that there are extensions.
+/// The bit of the same flags that marks a file with extensions.
 pub(super) const HAS_EXTENSIONS: u8 = 2;
 /// Type of the extension that states the axes (Adobe).
 pub(super) const COORDINATE_SYSTEM: u32 = 0xadbe_0003;

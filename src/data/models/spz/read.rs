@@ -17,7 +17,7 @@ use densify_core::antialiasing::Antialiasing;
 use densify_core::files::max_unpacked_bytes;
 use densify_core::gaussians::{MAX_SH_DEGREE, sh_coefficients};
 
-/// Smallest window that every zstd decoder supports `[bytes]` (RFC 8878, 3.1.1.1.2).
+/// Window that every zstd decoder should support `[bytes]` (RFC 8878, 3.1.1.1.2).
 const WINDOW: u64 = 8 << 20;
 
 /// Largest size of the extensions that are read `[bytes]`.
@@ -48,7 +48,7 @@ pub(super) fn read(path: &Path, input: impl BufRead, length: u64) -> Result<Spla
     Ok(file)
 }
 
-/// As [`read`], in the axes of the file, which are also returned if it states them.
+/// As [`read`], but in the axes of the file; these are returned, too, if the file states them.
 pub(in crate::models) fn read_as_stored(
     path: &Path,
     mut input: impl BufRead,
@@ -90,7 +90,7 @@ fn read_header(
         return wrong(format!("densify reads versions 2 and 3, in gzip, and 4, not {version}"));
     }
     if sh_degree > MAX_SH_DEGREE {
-        return wrong(format!("colours of degree {sh_degree}, but densify has 0 to 3"));
+        return wrong(format!("colours have degree {sh_degree}, but densify reads 0 to 3"));
     }
     if fractional_bits > 23 {
         return wrong(format!("positions have {fractional_bits} fractional bits of 24"));
@@ -223,8 +223,8 @@ fn decode(
     Ok((file, extensions.axes))
 }
 
-/// Version 2 has x, y, z in a byte each. Later versions have the largest component's index in the order (x, y, z, w),
-/// then sign and nine bits of each of the others, up to 1/√2.
+/// Version 2 stores x, y and z in a byte each. Later versions store the largest component's index in the order (x, y,
+/// z, w), then sign and nine bits of each of the others, up to 1/√2.
 fn quaternion(bytes: &[u8]) -> [f32; 4] {
     let [x, y, z, w] = if let &[x, y, z] = bytes {
         from_smallest_three(3, [x, y, z].map(|v| f32::from(v) / 127.5 - 1.0))

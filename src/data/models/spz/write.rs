@@ -26,7 +26,7 @@ const MAX_COLOUR_ERROR: f64 = 0.0165;
 /// Largest step of coefficients, in units of 1/128.
 const MAX_STEP: u8 = 31;
 
-/// Holds the quantised values of all Gaussians. Only their positions are not quantised yet, because the fixed point
+/// Holds the quantised values of all Gaussians. Only positions stay in f32 until the end, because their fixed point
 /// depends on all of them.
 #[derive(Default)]
 pub(super) struct SpzWriter {
@@ -63,7 +63,7 @@ impl ModelWriter for SpzWriter {
     }
 
     fn states_antialiasing(&self, antialiasing: Antialiasing) -> bool {
-        // The flag has no kernel; 0.3 is that of other readers.
+        // The flag states no kernel; other readers use 0.3.
         antialiasing != Antialiasing::Narrow
     }
 

@@ -1,4 +1,4 @@
-//! Tests of how much quantised formats change models, also models beyond the formats' ranges.
+//! Tests of how much quantised formats change models, including models beyond the formats' ranges.
 
 use super::round_trips::plausible;
 use super::saved;
@@ -71,7 +71,7 @@ fn values_that_a_format_cannot_hold_count_as_changes() {
 
 /// Changes that are hardly visible are not noted: of small or faint Gaussians, or of the thin axis of flat ones.
 #[test]
-fn changes_count_as_much_as_they_are_visible() {
+fn changes_are_weighted_by_their_visibility() {
     let mut model = trained();
     // All Gaussians are as thin as a plane, and one in fifty is so small that no format with limits holds it.
     model.log_scales.iter_mut().for_each(|logs| logs[2] = -15.0);

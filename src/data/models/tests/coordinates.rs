@@ -9,7 +9,7 @@ use crate::models::{
 };
 use densify_core::gaussians::Gaussians;
 
-/// As in UTM `[m]`.
+/// An offset as in UTM `[m]`.
 const OFFSET: [f64; 3] = [512_345.5, 5_400_123.25, -81.125];
 const COMMENT: &[u8] = b"comment densify offset 512345.5 5400123.25 -81.125\n";
 
@@ -73,7 +73,7 @@ fn coordinates_in_f64_are_kept_by_ply_and_refused_by_others() {
     assert_eq!(found.origin, OFFSET);
     assert!(apart(&found, &model) < 1e-9, "{}", apart(&found, &model));
     assert_eq!((&found.log_scales, &found.sh), (&model.log_scales, &model.sh));
-    // Other programs have no comment.
+    // Other programs write no such comment.
     let comment = b"comment densify near 512345.5 5400123.25 -81.125\n";
     let at = find_bytes(&bytes, comment);
     bytes.drain(at..at + comment.len());
@@ -119,11 +119,11 @@ fn damaged_sidecars_are_refused_by_file_and_field() {
     }
     std::fs::write(&sidecar, "{\"offset\": [1, 2, 3]}").unwrap();
     assert_eq!(read_model(&path).unwrap().gaussians.origin, [1.0, 2.0, 3.0]);
-    // It belongs to the file that it was written with.
+    // A sidecar belongs to the file with which it was written.
     std::fs::write(&sidecar, &good).unwrap();
     std::fs::write(&path, written(find("spz").unwrap(), &plausible(301, 1)).unwrap()).unwrap();
     refused(&path, &["model.spz.offset.json", "bytes"]);
-    // The header of a PLY and a sidecar.
+    // A sidecar may not contradict the header of a PLY.
     let path = folder.path().join("model.ply");
     PLY.save(&remote(), &path).unwrap();
     std::fs::write(sidecar_path(&path), "{\"offset\": [1, 2, 3]}").unwrap();
@@ -131,7 +131,7 @@ fn damaged_sidecars_are_refused_by_file_and_field() {
 }
 
 #[test]
-fn an_offset_that_gains_nothing_is_not_kept() {
+fn an_offset_that_gains_no_precision_is_not_kept() {
     let mut model = plausible(300, 1);
     model.origin = [1.0, 0.0, 0.0];
     assert!(is_finer_than_f32(&model));
@@ -141,7 +141,7 @@ fn an_offset_that_gains_nothing_is_not_kept() {
 }
 
 #[test]
-fn a_name_that_leaves_no_room_for_a_sidecar_needs_none() {
+fn a_file_name_too_long_for_a_sidecar_is_accepted_unless_one_is_needed() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join(format!("{}.spz", "n".repeat(246)));
     let model = plausible(40, 0);

@@ -138,7 +138,7 @@ fn a_failed_source_leaves_the_old_file() {
 }
 
 #[test]
-fn an_unknown_format_names_the_nearest_and_the_list() {
+fn the_error_for_an_unknown_format_names_the_nearest_and_all_formats() {
     let message = find("plz").unwrap_err().to_string();
     assert!(message.contains("did you mean `ply`?") && message.contains("call-log, "), "{message}");
     assert!(!find("zzz").unwrap_err().to_string().contains("did you mean"));
@@ -154,7 +154,7 @@ fn the_writer_of_ply_holds_as_many_bytes_as_it_reports() {
     let shape = Shape::from(&whole);
     let mut writer = PLY.open_writer(shape, &mut io::sink()).unwrap();
 
-    /// The largest write.
+    /// Remembers the size of the largest write `[bytes]`.
     struct Largest(usize);
     impl Write for Largest {
         fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
@@ -192,6 +192,6 @@ fn the_ply_layout_is_that_of_the_original_trainer() {
         .map(|b| f32::from_le_bytes(b.try_into().unwrap()))
         .collect();
     assert_eq!(values.len(), expected.len());
-    // Coefficient k of channel c is 3 + 3k + c here; the file goes channel by channel.
+    // In memory, coefficient k of channel c is value 3 + 3k + c; the file goes channel by channel.
     assert_eq!(values[3..18], [0., 0., 0., 0., 1., 2., 3., 6., 9., 4., 7., 10., 5., 8., 11.]);
 }

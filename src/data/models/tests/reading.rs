@@ -16,7 +16,7 @@ fn read(path: &Path) -> Gaussians {
     file.gaussians
 }
 
-/// The files of `sog/folder`.
+/// A temporary folder with the files of the corpus entry `sog/folder`.
 fn sog_folder() -> tempfile::TempDir {
     let folder = tempfile::tempdir().unwrap();
     let bytes = std::fs::read(corpus("sog/folder")).unwrap();

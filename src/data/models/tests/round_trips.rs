@@ -68,7 +68,7 @@ fn errors(a: &Gaussians, b: &Gaussians) -> [f32; 5] {
 
 #[test]
 fn formats_in_f32_keep_every_bit() {
-    // Numbers of rows around 256, which the PLY writer writes at once.
+    // The numbers of rows lie around 256, the number that the PLY writer writes at once.
     for (name, rows) in
         [("ply", 0), ("ply", 1), ("ply", 255), ("ply", 256), ("ply", 700), ("glb", 100)]
     {
@@ -102,7 +102,7 @@ fn formats_are_lossy_if_a_round_trip_changes_values() {
 }
 
 #[test]
-fn quantised_formats_are_off_by_half_a_step() {
+fn quantised_formats_round_trip_within_half_a_step() {
     // In the order compressed PLY, SPZ, SOG. Positions: 11 bits of a chunk's range (y: 10), 12 fractional bits, 16 bits
     // of a logarithm. Log-scales: 10 bits of a range of 3, sixteenths, a codebook, whose entries are far apart where
     // there are few values. Opacities: a byte. Colours: steps of 1/32; steps of 1/38 and, within the allowed error,

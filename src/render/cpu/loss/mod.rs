@@ -25,7 +25,7 @@ use pulp::{Arch, Simd, WithSimd};
 use rayon::prelude::*;
 
 use super::blocks::parts;
-use super::rasterize::{DARK, TileCanvas, copy_row_of_plane, set_row_of_plane};
+use super::rasterize::{TileCanvas, ZERO_PLANE, copy_row_of_plane, set_row_of_plane};
 use super::rasterize_bwd::TileGradient;
 use super::simd::{V, WIDTH, each};
 use super::threads::Threads;
@@ -57,8 +57,8 @@ const MAX_LINES: usize = CONVOLVED * TOGETHER + 2;
 pub(super) struct LossBuffers {
     /// e, y − ½, and three derivatives. Shape: `[image rows, pitch]` each.
     planes: [Vec<[f32; WIDTH]>; 5],
-    /// Errors per pixel, means over the channels, each if requested: the errors that select candidates, and those that
-    /// rows accumulate. Same shape.
+    /// Errors per pixel (means over the channels), if requested: those that select candidates, and those that rows
+    /// accumulate. Shape as above.
     errors: [Vec<[f32; WIDTH]>; 2],
     segments: Segments,
     weights: PixelWeights,
@@ -233,7 +233,7 @@ impl LossBuffers {
         let line = || vec![0.0; segments.stride()];
         threads.each_with("loss by pixel", tasks, line, |pixels, (i, tiles)| {
             for tile in tiles.iter_mut() {
-                tile.planes[4] = DARK;
+                tile.planes[4] = ZERO_PLANE;
             }
             for row in 0..TILE.min(grid.height - i * TILE) {
                 let y = i * TILE + row;
@@ -271,8 +271,8 @@ struct Source<'a> {
     channel: usize,
 }
 
-/// Computes the lines of e and y − ½ in one strip of one channel; e is (rendering − target)·mask. The padding to the
-/// right has the values of pixels outside the image.
+/// First pass over one strip of one channel: the lines of e and y − ½; e is (rendering − target)·mask. The padding to
+/// the right has the values of pixels outside the image.
 struct Lines<'a> {
     source: Source<'a>,
     segments: Segments,
@@ -344,8 +344,7 @@ fn scratch_lines<const A: usize, const B: usize>(
     )
 }
 
-/// First pass over one strip of one channel: SSIM and its derivatives with respect to μₑ, E[e²] and
-/// E[e·(y − ½)].
+/// Second pass over one strip of one channel: SSIM and its derivatives with respect to μₑ, E[e²] and E[e·(y − ½)].
 struct Similarity<'a> {
     width: usize,
     segments: Segments,
@@ -483,7 +482,7 @@ fn around<const M: usize>(line: &Line, first: usize) -> &[[f32; WIDTH]; M] {
     line[first..].first_chunk().expect("a padded line")
 }
 
-/// Second pass over one strip of one channel: dL/dpixel.
+/// Third pass over one strip of one channel: dL/dpixel.
 struct Gradient<'a> {
     grid: &'a Grid,
     segments: Segments,
@@ -516,7 +515,7 @@ impl WithSimd for Gradient<'_> {
         let zero = V::zero(s);
         if rows < STRIP {
             for tile in tiles.iter_mut() {
-                tile.planes[channel] = DARK;
+                tile.planes[channel] = ZERO_PLANE;
             }
         }
         for row in 0..rows {

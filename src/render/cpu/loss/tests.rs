@@ -5,7 +5,7 @@ use std::ops::Range;
 use super::super::tiles::Grid;
 use super::*;
 
-/// The scalars, dL/dpixel and each pixel's part of the loss for two structured images.
+/// The scalars, dL/dpixel and each pixel's part of the loss for a structured rendering and target.
 fn run(requests: ErrorRequests, mask: bool) -> (LossValue, Vec<f32>, Vec<f32>) {
     run_in(&mut LossBuffers::new(), [37, 50], requests, mask)
 }
@@ -33,7 +33,7 @@ fn run_in(
         alpha: None,
         mask: mask.then(|| (0..pixels).map(|i| (i * 37 % 256) as u8).collect()),
     };
-    let mut gradient = vec![TileGradient { planes: [DARK; 5] }; grid.tiles()];
+    let mut gradient = vec![TileGradient { planes: [ZERO_PLANE; 5] }; grid.tiles()];
     let threads = Threads::new(Some(2)).expect("threads");
     let (arch, gradients) = (Arch::new(), &mut gradient);
     let value = buffers.run(&threads, arch, &grid, &canvas, &target, [0.0; 3], gradients, requests);
@@ -65,17 +65,17 @@ fn the_mean_of_the_pixel_errors_is_the_loss() {
 fn reused_buffers_give_the_same_results_as_new_ones() {
     let requests =
         ErrorRequests { for_candidates: Some([0.3, 0.7]), for_rows: Some(ErrorScore::default()) };
-    let all = |buffers: &mut LossBuffers, size: [u32; 2]| {
+    let both = |buffers: &mut LossBuffers, size: [u32; 2]| {
         let [width, height] = size.map(|side| side as usize);
-        let found = run_in(buffers, size, requests, false);
+        let loss = run_in(buffers, size, requests, false);
         let at = |i| buffers.error_at(i % width, i / width);
         let errors: Vec<f32> = (0..width * height).map(at).collect();
         assert!(errors.iter().any(|error| *error > 0.0));
-        (found, errors)
+        (loss, errors)
     };
     let mut buffers = LossBuffers::new();
     for size in [[37, 50], [60, 20], [37, 50], [100, 70]] {
-        assert_eq!(all(&mut buffers, size), all(&mut LossBuffers::new(), size), "{size:?}");
+        assert_eq!(both(&mut buffers, size), both(&mut LossBuffers::new(), size), "{size:?}");
         run_in(&mut buffers, [50, 90], ErrorRequests::default(), true);
     }
 }

@@ -31,7 +31,7 @@ const WINDOW: [f32; 2 * REACH + 1] = [
 pub(super) const TOGETHER: usize = 4;
 /// Number of rows or vectors within reach of [`TOGETHER`] adjacent ones.
 const NEAR: usize = TOGETHER + 2 * REACH;
-/// Pixels per run, which are transposed together; a segment consists of whole runs.
+/// Number of pixels per run. The pixels of four runs are transposed together; a segment consists of whole runs.
 const RUN: usize = 4;
 
 /// The arrangement of a line's pixels: lane l of vector i is pixel i of segment l.
@@ -277,7 +277,7 @@ pub(super) fn horizontal<S: Simd, const N: usize, const M: usize>(
     lane: usize,
 ) -> [V<S>; N] {
     const { assert!(N <= TOGETHER && M == N + 2 * REACH) };
-    // Index M and all later ones are not within reach.
+    // Vectors from index M on are not within reach.
     let x = near!(d => V::load(s, &around[if d < M { d } else { 0 }][lane..]));
     let mut sums = [V::zero(s); N];
     for (n, sum) in sums.iter_mut().enumerate() {
@@ -305,9 +305,9 @@ mod tests {
                 let [vector, lane] = segments.place(x);
                 assert_eq!(inner[vector][lane], pixel);
             }
-            let mut again = vec![-1.0; stride];
-            segments.restore(&inner, &mut again);
-            assert_eq!(again, pixels);
+            let mut restored = vec![-1.0; stride];
+            segments.restore(&inner, &mut restored);
+            assert_eq!(restored, pixels);
             // In each lane, the vector `d` places farther on has the pixel `d` places to the right.
             segments.pad(&mut line, 0.5);
             for (d, vector) in line.iter().enumerate() {

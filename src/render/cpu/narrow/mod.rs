@@ -1,7 +1,7 @@
 //! Formats of 8 and 16 bits, sixteen numbers at a time, and the random bits for rounding to them.
 //!
 //! Rounding is stochastic (Gupta et al. 2015, section 3.1): a number becomes one of its two representable neighbours,
-//! the nearer more often, so that the mean is preserved. A representable number is unchanged, whatever the random
+//! the nearer one more often, so that the mean is preserved. A representable number is unchanged, whatever the random
 //! bits.
 //!
 //! The code loops over arrays of integers instead of using `pulp`, which has no vectors of 8 and 16 bits to convert
@@ -33,7 +33,7 @@ const F8_MAX: u32 = 0xfe;
 const F8_NAN: u32 = 0xff;
 /// |first moment| / √(second moment) is at most this: by Cauchy and Schwarz,
 /// (1 − β₁)/√((1 − β₂)·(1 − β₁²/β₂)) with β₁ = 0.9, β₂ = 0.999. Where the second moment was rounded down,
-/// large ratios may be clamped; noise gives 0.23.
+/// large ratios may be clamped; gradients of pure noise give a ratio of about 0.23.
 const RATIO_MAX: f32 = 7.3;
 const RATIO_STEP: f32 = RATIO_MAX / 127.0;
 
@@ -41,7 +41,7 @@ const RATIO_STEP: f32 = RATIO_MAX / 127.0;
 /// so independent of threads.
 ///
 /// A hash starts the sequence of each row, and a linear congruential generator (the constants of
-/// *Numerical Recipes*) continues it. Only its upper bits are used, as the lower ones are poor.
+/// *Numerical Recipes*) continues it. Only its upper bits are used, as its lower bits are less random.
 pub(super) struct Draws([u32; WIDTH]);
 
 impl Draws {
@@ -73,7 +73,7 @@ pub(super) trait Narrow: Copy + Default {
     /// Converts exactly.
     fn to_f32(self) -> f32;
     /// Rounds to one of the two neighbours of `x`, by the upper bits of `random`. Finite numbers stay finite, and
-    /// non-finite ones non-finite.
+    /// non-finite numbers stay non-finite.
     fn round(x: f32, random: u32) -> Self;
     /// Rounds to the nearest number, as the middle random value does; ties go up.
     #[inline(always)]
@@ -263,8 +263,8 @@ pub(super) fn ratios(first: &[f32], second: &[F8], to: &mut [i8], draws: &mut Dr
         for lane in 0..WIDTH {
             let root = RATIO_STEP * second[lane].to_f32().sqrt();
             let draw = unit(random[lane], 11) + 0.5 / 2048.0;
-            // 0 if the second moment is 0, also where the square underflowed in f32. NaN becomes 0 here, and
-            // becomes NaN again when it is multiplied by its second moment, which is NaN.
+            // The ratio is 0 if the second moment is 0, even if only because the square underflowed in f32. NaN becomes
+            // 0 here, and becomes NaN again when it is multiplied by the second moment, which is NaN.
             let ratio = if root > 0.0 { first[lane] / root } else { 0.0 };
             to[lane] = round_to_integer(ratio.clamp(-127.0, 127.0), draw) as i8;
         }

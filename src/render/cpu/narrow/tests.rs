@@ -65,16 +65,16 @@ fn f16_numbers_are_those_of_the_standard() {
 
 /// Checks that over all draws a number in range is rounded to each of its two neighbours with the right frequency, and
 /// that a number out of range becomes the nearest end.
-fn assert_fair<T: Narrow>(all: &[f32]) {
-    let (least, most) = (all[0], all[all.len() - 1]);
+fn assert_fair<T: Narrow>(values: &[f32]) {
+    let (least, most) = (values[0], values[values.len() - 1]);
     for x in numbers() {
         if x < least || x > most {
             let end = if x < least { least } else { most };
             assert!(draws().all(|random| T::round(x, random).to_f32() == end), "{x:e}");
             continue;
         }
-        let above = all.partition_point(|&y| y < x);
-        let (low, high) = (all[above.saturating_sub(1)], all[above]);
+        let above = values.partition_point(|&y| y < x);
+        let (low, high) = (values[above.saturating_sub(1)], values[above]);
         let step = f64::from(high) - f64::from(low);
         let share = if step == 0.0 { 1.0 } else { (f64::from(x) - f64::from(low)) / step };
         let mut ups = 0;
@@ -92,12 +92,12 @@ fn assert_fair<T: Narrow>(all: &[f32]) {
 #[test]
 fn rounding_is_fair_and_stays_between_the_neighbours() {
     let halves = (0..=F16_MAX as u16).map(|bits| F16(bits).to_f32());
-    let mut all: Vec<f32> = halves.flat_map(|x| [x, -x]).collect();
-    all.sort_by(f32::total_cmp);
-    assert_fair::<F16>(&all);
+    let mut values: Vec<f32> = halves.flat_map(|x| [x, -x]).collect();
+    values.sort_by(f32::total_cmp);
+    assert_fair::<F16>(&values);
     for x in numbers().filter(|x| x.abs() <= 65_504.0) {
-        let above = all.partition_point(|&y| y < x);
-        let step = f64::from(all[above]) - f64::from(all[above.saturating_sub(1)]);
+        let above = values.partition_point(|&y| y < x);
+        let step = f64::from(values[above]) - f64::from(values[above.saturating_sub(1)]);
         let off = f64::from(F16::nearest(x).to_f32()) - f64::from(x);
         assert!(off.abs() <= 0.5001 * step, "{x:e}: the nearest is off by {off:e} of {step:e}");
     }
@@ -106,15 +106,15 @@ fn rounding_is_fair_and_stays_between_the_neighbours() {
 /// Bytes: 7 bits of exponent and one of significand, without a sign.
 #[test]
 fn bytes_are_rounded_fairly_and_cover_the_range_that_adam_needs() {
-    let all: Vec<f32> = (0..=F8_MAX as u8).map(|bits| F8(bits).to_f32()).collect();
-    assert!(all.is_sorted() && all[0] == 0.0, "{all:?}");
+    let values: Vec<f32> = (0..=F8_MAX as u8).map(|bits| F8(bits).to_f32()).collect();
+    assert!(values.is_sorted() && values[0] == 0.0, "{values:?}");
     assert!(F8(F8_NAN as u8).to_f32().is_nan());
-    let (least, most) = (all[1], all[all.len() - 1]);
+    let (least, most) = (values[1], values[values.len() - 1]);
     assert_eq!((least, most), (2_f32.powi(-96), 1.5 * 2_f32.powi(30)));
     // The square root of the smallest positive number is within a few times Adam's epsilon, 1e-15.
     assert!(least.sqrt() < 4e-15);
-    assert!(all[1..].windows(2).all(|pair| pair[1] <= 1.5 * pair[0]), "{all:?}");
-    assert_fair::<F8>(&all);
+    assert!(values[1..].windows(2).all(|pair| pair[1] <= 1.5 * pair[0]), "{values:?}");
+    assert_fair::<F8>(&values);
 }
 
 /// Fixed point: representable numbers are preserved, and rounding is fair.
@@ -218,18 +218,18 @@ fn a_zero_or_nonfinite_second_moment_makes_the_first_zero_or_nan() {
 fn draws_are_independent() {
     const BLOCKS: usize = 256;
     const PLANES: usize = 56;
-    let table = |seed, step, which: usize| -> Vec<f64> {
+    let table = |seed, step, array: usize| -> Vec<f64> {
         let rng = PolicyRng::new(seed, step);
-        let mut all = Vec::new();
+        let mut values = Vec::new();
         for block in 0..BLOCKS {
             let mut draws = Draws::of_block(&rng, block * WIDTH);
             for _ in 0..PLANES {
-                all.extend(
-                    draws[which].next().map(|x| f64::from(x >> 8) / f64::from(1 << 24) - 0.5),
+                values.extend(
+                    draws[array].next().map(|x| f64::from(x >> 8) / f64::from(1 << 24) - 0.5),
                 );
             }
         }
-        all
+        values
     };
     let first = table(1, 500, 0);
     let n = first.len() as f64;
@@ -244,7 +244,7 @@ fn draws_are_independent() {
     let found = [
         ("rows", correlation(&first, &first[1..])),
         ("planes", correlation(&first, &first[WIDTH..])),
-        ("next plane but one", correlation(&first, &first[2 * WIDTH..])),
+        ("planes two apart", correlation(&first, &first[2 * WIDTH..])),
         ("blocks", correlation(&first, &first[WIDTH * PLANES..])),
         ("steps", correlation(&first, &table(1, 501, 0))),
         ("seeds", correlation(&first, &table(2, 500, 0))),

@@ -30,7 +30,7 @@ pub(super) struct SizeRequest {
     pub(crate) min_rows: usize,
     /// Number of rows at the start; the degree is lowered if fewer fit.
     pub(crate) enough_rows: usize,
-    /// Maximum number of rows: the number wanted, or the largest possible if that is smaller; >= 1.
+    /// Maximum number of rows: the number wanted, or the largest number possible if that is smaller; >= 1.
     pub(crate) max_rows: usize,
     /// Degrees to choose from; the highest is the one wanted.
     pub(crate) sh_degree: RangeInclusive<u8>,
@@ -49,21 +49,21 @@ pub(super) struct SizeRequest {
     pub(crate) all_image_bytes: u64,
 }
 
-/// The result of [`fit`].
+/// The size that [`fit`] found.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Fit {
-    /// The size found.
+    /// The size.
     pub(crate) size: RunSize,
-    /// Memory limits the number of rows.
+    /// True if memory limits the number of rows.
     pub(crate) by_memory: bool,
-    /// Rows that fit at the wanted degree.
+    /// Number of rows that fit at the wanted degree.
     pub(crate) at_wanted_degree: usize,
 }
 
-/// Default (row, tile) pairs per row: the minimum, and larger numbers if memory is left. A view rarely
-/// has three per row; views with more than the limit are rendered in bands, with the same result.
+/// Default (row, tile) pairs per row: the minimum, and larger numbers if memory is left. A view rarely has three pairs
+/// per row; views with more pairs than the limit are rendered in bands, with the same result.
 pub(super) const PAIRS: [usize; 3] = [4, 8, 16];
-/// Decoded images may take the memory divided by this number.
+/// Decoded images may take the memory limit divided by this number.
 pub(super) const IMAGE_SHARE_DIVISOR: u64 = 8;
 
 impl SizeRequest {
@@ -94,17 +94,17 @@ pub(super) fn fit<E>(
     let least = request.min_rows.clamp(1, most);
     let enough = request.enough_rows.clamp(least, most);
     let mut at_wanted_degree = None;
-    let mut found = None;
+    let mut largest = None;
     for degree in request.sh_degree.clone().rev() {
         let size = |rows| request.size(rows, degree, request.pairs[0]);
         let rows = largest_where(least, most, |rows| Ok(bytes(&size(rows))? <= request.memory))?;
         at_wanted_degree.get_or_insert(rows.unwrap_or(0));
-        found = rows.map(|rows| (rows, degree));
+        largest = rows.map(|rows| (rows, degree));
         if rows.is_some_and(|rows| rows >= enough) {
             break;
         }
     }
-    let Some((rows, degree)) = found else { return Ok(None) };
+    let Some((rows, degree)) = largest else { return Ok(None) };
     let mut size = request.size(rows, degree, request.pairs[0]);
     if rows == most {
         for pairs in request.pairs.into_iter().skip(1) {
@@ -117,7 +117,7 @@ pub(super) fn fit<E>(
             let all = RunSize { image_cache: request.all_image_bytes, ..size };
             let left = request.memory.saturating_sub(bytes(&size)?);
             // Images in use are counted even if the cache is smaller, so a cache of all images may fit although `left`
-            // is too small. So try that first.
+            // is too small: try that cache first.
             size.image_cache = if bytes(&all)? <= request.memory {
                 request.all_image_bytes
             } else {
@@ -129,7 +129,7 @@ pub(super) fn fit<E>(
     Ok(Some(Fit { size, by_memory: rows < most, at_wanted_degree }))
 }
 
-/// The smallest memory in which a model fits, in multiples of `step` bytes; `None` if there is none.
+/// The smallest memory in which a model fits, in multiples of `step` bytes; `None` if none suffices.
 pub(super) fn min_memory<E>(
     request: &SizeRequest,
     step: u64,
@@ -148,8 +148,8 @@ pub(super) fn min_memory<E>(
     Ok(Some(insufficient.map_or(0, |steps| steps as u64 + 1) * step))
 }
 
-/// The largest number in `least..=most` for which `holds` is true; it must be true up to some number
-/// and false above.
+/// The largest number in `least..=most` for which `holds` returns true, which it must do up to some number and not
+/// above it.
 pub(super) fn largest_where<E>(
     least: usize,
     most: usize,

@@ -60,7 +60,7 @@ fn request(run: &ImaginaryRun, memory: u64) -> SizeRequest {
     }
 }
 
-/// Requests of any memory for runs with or without given sizes.
+/// Requests with any memory limit, for runs with and without given sizes.
 fn requests() -> impl Strategy<Value = (ImaginaryRun, SizeRequest)> {
     let sizes = (
         0..2_000_000_000_u64,
@@ -170,8 +170,8 @@ fn a_degree_is_lowered_only_if_the_initial_rows_do_not_fit() {
         (19_999 * 136, 0, 19_984),
         (1_008 * 136, 0, 1_008),
     ] {
-        let found = run.fit(&request(&run, memory)).expect("it fits").size;
-        assert_eq!((found.sh_degree, found.rows), (degree, rows), "{memory}");
+        let size = run.fit(&request(&run, memory)).expect("it fits").size;
+        assert_eq!((size.sh_degree, size.rows), (degree, rows), "{memory}");
     }
     assert_eq!(run.fit(&request(&run, 1_008 * 136 - 1)), None);
 }

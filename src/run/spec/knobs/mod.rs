@@ -22,21 +22,21 @@ pub use table::KNOBS;
 pub struct Knob {
     /// Such as `alpha_min`.
     pub name: &'static str,
-    /// Value if it is not set.
+    /// Its value if none is set.
     pub default: &'static str,
     /// The values that it may have.
     pub domain: Domain,
     /// The unit of its values; empty for words and plain numbers.
     pub unit: &'static str,
-    /// The only backend that has it; `None`: all do.
+    /// The only backend that has this knob; `None`: all backends have it.
     pub only_on: Option<BackendKind>,
     /// The worst effect on the result.
     pub class: Class,
-    /// Effect and gain, in a line.
+    /// Its effect and gain, in one line.
     pub effect: &'static str,
     /// Values that `densify trade` measures, besides the default.
     pub levels: &'static [&'static str],
-    /// Sets it to a value in the table's spelling.
+    /// Sets the knob to a value in the table's spelling.
     pub(super) set: fn(&mut Knobs, &str),
 }
 
@@ -142,11 +142,11 @@ impl Knob {
         let known = self.levels.iter().copied().chain([self.default]);
         let same =
             |text: &&str| number(text).is_some_and(|number| number.total_cmp(&value).is_eq());
-        known.into_iter().find(same).map_or_else(|| plain(value), str::to_owned)
+        known.into_iter().find(same).map_or_else(|| shorter_notation(value), str::to_owned)
     }
 }
 
-/// A decimal or a fraction.
+/// Parses a decimal or a fraction.
 fn number(text: &str) -> Option<f64> {
     let value = match text.split_once('/') {
         Some((above, below)) => {
@@ -158,7 +158,7 @@ fn number(text: &str) -> Option<f64> {
 }
 
 /// The shorter of the decimal and the scientific notation of a number.
-fn plain(value: f64) -> String {
+fn shorter_notation(value: f64) -> String {
     let (decimal, power) = (format!("{value}"), format!("{value:e}"));
     if power.len() < decimal.len() { power } else { decimal }
 }
@@ -184,7 +184,7 @@ impl fmt::Display for Domain {
                         let power = format!("{x:e}");
                         if power.len() < 5 { power } else { format!("1/{inverse}") }
                     }
-                    _ => plain(*x),
+                    _ => shorter_notation(*x),
                 };
                 write!(f, "{} to {}", shown(least), shown(most))
             }

@@ -1,5 +1,5 @@
 //! Presets: knobs and options that are set together, named after what they promise. Each preset quotes the measurements
-//! by `densify trade` that its levels follow from.
+//! by `densify trade` on which it is based.
 
 use std::fmt;
 
@@ -10,7 +10,7 @@ use super::KnobError;
 pub struct Preset {
     /// Such as `fast`.
     pub name: &'static str,
-    /// The promise, in a line.
+    /// What the preset promises, in one line.
     pub promise: &'static str,
     /// Knobs and options by name, each with its value.
     pub levels: &'static [(&'static str, &'static str)],
@@ -21,16 +21,16 @@ pub struct Preset {
 /// Measured cost and gain of a preset against `exact`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Measured {
-    /// Mean difference of PSNR on views held out `[dB]`.
+    /// Mean difference of PSNR on held-out views `[dB]`.
     pub psnr: f64,
     /// 95 % interval of this difference `[dB]`.
     pub interval: [f64; 2],
-    /// Processor time of training, as a ratio.
+    /// Processor time of training, as a ratio to that of `exact`.
     pub seconds: f64,
-    /// Peak memory of the process, as a ratio.
+    /// Peak memory of the process, as a ratio to that of `exact`.
     pub peak: f64,
-    /// Scenes and size of the runs.
-    pub on: &'static str,
+    /// Scenes and size of the measured runs.
+    pub runs: &'static str,
     /// The command that measured it.
     pub command: &'static str,
 }
@@ -80,7 +80,7 @@ pub static PRESETS: &[Preset] = &[
             interval: [-0.15, 0.17],
             seconds: 0.79,
             peak: 1.00,
-            on: LONG_STUDY,
+            runs: LONG_STUDY,
             command: LONG_COMMAND,
         }),
     },
@@ -93,13 +93,13 @@ pub static PRESETS: &[Preset] = &[
             interval: [-0.15, 0.21],
             seconds: 0.49,
             peak: 1.00,
-            on: LONG_STUDY,
+            runs: LONG_STUDY,
             command: LONG_COMMAND,
         }),
     },
     Preset {
         name: "tiny-memory",
-        promise: "memory before time",
+        promise: "little memory, at the cost of time",
         // 478 bytes per row at degree 3 with `diet`; docs/memory.md has the table.
         levels: &[
             ("image_cache", "auto"),
@@ -112,7 +112,7 @@ pub static PRESETS: &[Preset] = &[
             interval: [-0.01, 0.24],
             seconds: 1.40,
             peak: 0.69,
-            on: STUDY,
+            runs: STUDY,
             command: COMMAND,
         }),
     },
@@ -140,10 +140,10 @@ impl fmt::Display for Preset {
         write!(f, "{}: {}; {}; ", self.name, self.promise, levels.join(" "))?;
         match self.measured {
             None => f.write_str("the reference for the others"),
-            Some(Measured { psnr, interval: [low, high], seconds, peak, on, .. }) => write!(
+            Some(Measured { psnr, interval: [low, high], seconds, peak, runs, .. }) => write!(
                 f,
                 "{psnr:+.2} dB [{low:+.2}, {high:+.2}], {seconds:.2} of the processor time and {peak:.2} \
-                 of the memory of exact ({on})"
+                 of the memory of exact ({runs})"
             ),
         }
     }

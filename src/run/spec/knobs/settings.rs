@@ -15,11 +15,11 @@ pub struct Knobs {
     pub shortcuts: Shortcuts,
     /// Storage of parameters and moments.
     pub storage: Storage,
-    /// Maximum number of (row, tile) pairs per row of the budget; `None`: from `--tile-cap` and `--memory`.
+    /// Maximum number of (row, tile) pairs per row of the budget; `None`: it follows from `--tile-cap` and `--memory`.
     pub pairs_per_row: Option<usize>,
     /// The order in which a GPU adds up gradients; `None`: the fastest that it has.
     pub accumulation: Option<Accumulation>,
-    /// Values that were set, by name, in the table's spelling.
+    /// The values that were set, by name of the knob, in the table's spelling.
     values: BTreeMap<&'static str, String>,
 }
 
@@ -40,10 +40,10 @@ impl Default for Knobs {
 }
 
 impl Knobs {
-    /// The defaults, with these values by name.
+    /// The knobs of this table; the others have their defaults.
     ///
     /// # Errors
-    /// When there is no such knob, or its value is outside its domain.
+    /// When a name is not a knob, or its value is outside the knob's domain.
     pub fn from_table(table: &Table) -> Result<Self, KnobError> {
         let mut knobs = Self::default();
         for (name, value) in table {
@@ -59,7 +59,7 @@ impl Knobs {
     /// Sets a knob.
     ///
     /// # Errors
-    /// When there is no such knob, or its value is outside its domain.
+    /// When a name is not a knob, or its value is outside the knob's domain.
     pub fn set(&mut self, name: &str, value: &str) -> Result<(), KnobError> {
         let knob = find(name)?;
         let value = knob.canonical(value)?;
@@ -80,7 +80,7 @@ impl Knobs {
         self.iter().filter(|(knob, value)| *value != knob.default)
     }
 
-    /// All knobs by name, as in files.
+    /// All knobs by name, with their values, as in files.
     pub fn table(&self) -> Table {
         self.iter().map(|(knob, value)| (knob.name.to_owned(), value.into())).collect()
     }

@@ -5,7 +5,7 @@ use super::{Domain, Knob, number};
 use densify_render::BackendKind::{Cpu, Gpu};
 use densify_render::{Accumulation, MomentStorage, ParameterStorage};
 
-/// All knobs: exact ones, then bounded ones.
+/// All knobs: the exact ones, then the bounded ones.
 pub static KNOBS: &[Knob] = &[
     Knob {
         name: "pairs_per_row",
@@ -14,7 +14,7 @@ pub static KNOBS: &[Knob] = &[
         unit: "pairs",
         only_on: Some(Cpu),
         class: Exact,
-        effect: "pairs held per Gaussian, 2 in 5 with gradients; auto: 16 (with --memory 4 to 16), all with gradients",
+        effect: "pairs held per Gaussian, 2 in 5 with gradients; auto: 16 (4 to 16 with --memory), all with gradients",
         levels: &["4", "2", "1"],
         set: |knobs, value| knobs.pairs_per_row = value.parse().ok(),
     },
@@ -36,7 +36,7 @@ pub static KNOBS: &[Knob] = &[
         unit: "",
         only_on: None,
         class: Bounded,
-        effect: "a pixel stops before its transmittance falls below this; with a larger value it stops sooner",
+        effect: "blending of a pixel stops before its transmittance falls below this; a larger value stops it sooner",
         levels: &["1e-5", "1e-3", "1e-2"],
         set: |knobs, value| knobs.shortcuts.transmittance_min = real(value) as f32,
     },
@@ -47,7 +47,7 @@ pub static KNOBS: &[Knob] = &[
         unit: "",
         only_on: Some(Gpu),
         class: Bounded,
-        effect: "how gradients are added up: slots in a fixed order; cas and atomics in any: runs differ slightly",
+        effect: "order of adding gradients; slots: fixed; cas, atomics: any, so that runs differ slightly",
         levels: &["slots", "cas", "atomics"],
         set: |knobs, value| knobs.accumulation = Accumulation::from_name(value),
     },
@@ -74,7 +74,7 @@ pub static KNOBS: &[Knob] = &[
         unit: "",
         only_on: Some(Cpu),
         class: Bounded,
-        effect: "both8: both moments of the optimiser in a byte each",
+        effect: "both8: each of the optimiser's two moments in one byte",
         levels: &["both8"],
         set: |knobs, value| {
             knobs.storage.moments = match value {

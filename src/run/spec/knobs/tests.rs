@@ -72,8 +72,8 @@ fn each_level_of_each_knob_does_something() {
         for level in knob.levels {
             let table = [(knob.name.to_owned(), (*level).into())].into_iter().collect();
             let changed = Knobs::from_table(&table).unwrap();
-            let found: Vec<_> = changed.changed().map(|(k, v)| (k.name, v)).collect();
-            assert_eq!(found, [(knob.name, *level)]);
+            let settings: Vec<_> = changed.changed().map(|(k, v)| (k.name, v)).collect();
+            assert_eq!(settings, [(knob.name, *level)]);
             assert!(!seen.contains(&effect(&changed)), "{}={level} does nothing", knob.name);
             seen.push(effect(&changed));
         }
@@ -90,18 +90,18 @@ fn presets_are_made_of_knobs_and_options() {
             let knob = find(name).ok();
             assert!(knob.is_some() != RunOption::find(name).is_some(), "{name}");
             if let Some(knob) = knob {
-                let trades = knob.class != Class::Exact;
+                let is_bounded = knob.class != Class::Exact;
                 assert!(
-                    !trades || exact.iter().any(|(own, _)| own == name),
+                    !is_bounded || exact.iter().any(|(own, _)| own == name),
                     "{name}: not in exact"
                 );
                 assert_eq!(knob.canonical(value).as_deref(), Ok(*value), "{}: {name}", preset.name);
             }
         }
         // Every preset but the reference states its cost.
-        let said = preset.to_string();
-        assert_eq!(preset.measured.is_none(), preset.name == EXACT, "{said}");
-        assert_eq!(said.contains(" dB ["), preset.measured.is_some(), "{said}");
+        let shown = preset.to_string();
+        assert_eq!(preset.measured.is_none(), preset.name == EXACT, "{shown}");
+        assert_eq!(shown.contains(" dB ["), preset.measured.is_some(), "{shown}");
     }
     assert!(preset(DEFAULT_PRESET).is_ok());
     assert!(preset("quick").unwrap_err().to_string().contains("exact, balanced, fast"));

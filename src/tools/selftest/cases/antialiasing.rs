@@ -1,6 +1,6 @@
-//! Models trained with antialiasing, whose opacities are lowered where they are smaller than a pixel.
+//! Models trained with antialiasing, which lowers the opacity of Gaussians smaller than a pixel.
 
-use super::{GREY, axis_camera, flat_colour};
+use super::{GREEN, axis_camera, flat_colour};
 use crate::scenes;
 use crate::trial::Trial;
 use densify_core::antialiasing::Antialiasing;
@@ -32,7 +32,7 @@ pub(super) fn sizes(trial: &mut Trial<'_>) -> Result<(), BackendError> {
         // From 4 to 0.02 px at the median; the faintest are below the threshold of blending.
         for size in [1.0, 0.1, 0.02] {
             let label = format!("{kind}, {size} times");
-            trial.check(&label, &cloud(&camera, size, kind), &camera, GREY, 1)?;
+            trial.check(&label, &cloud(&camera, size, kind), &camera, GREEN, 1)?;
         }
         let turned = [0.9, -0.3, 0.4, 0.2];
         for (case, sizes_px) in [
@@ -42,13 +42,13 @@ pub(super) fn sizes(trial: &mut Trial<'_>) -> Result<(), BackendError> {
             ("a disc of no thickness", [0.5, 0.4, 1e-30]),
         ] {
             let label = format!("{kind}, {case}");
-            trial.check(&label, &one(sizes_px, turned, kind), &small, GREY, 0)?;
+            trial.check(&label, &one(sizes_px, turned, kind), &small, GREEN, 0)?;
         }
         // No accuracy is required, but all numbers stay finite.
         for value in [-80.0, -43.7, 20.0, 44.0, 89.0] {
             let mut model = cloud(&camera, 1.0, kind);
             model.log_scales.iter_mut().step_by(2).for_each(|scales| *scales = [value; 3]);
-            trial.check_finite(&format!("{kind}, log-scale {value}"), &model, &camera, GREY, 0)?;
+            trial.check_finite(&format!("{kind}, log-scale {value}"), &model, &camera, GREEN, 0)?;
         }
     }
     Ok(())

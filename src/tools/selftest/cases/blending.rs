@@ -1,10 +1,10 @@
 //! Opacities at the thresholds of the renderer, thousands of faint layers, and opaque rows in front of them.
 
-use super::{GREY, UPRIGHT, axis_camera, shade};
+use super::{GREEN, UPRIGHT, axis_camera, shade};
 use crate::compare::class;
 use crate::reference::{CLASSES, Model, Rules, View, render};
 use crate::scenes;
-use crate::trial::{Trial, count_broken};
+use crate::trial::{Trial, count_non_finite};
 use densify_core::gaussians::Gaussians;
 use densify_render::BackendError;
 
@@ -35,11 +35,11 @@ pub(super) fn opacities(trial: &mut Trial<'_>) -> Result<(), BackendError> {
         let shade = |k: usize| 0.6 - 0.3 * k as f32;
         scenes::push(&mut model, [0.0, 0.0, 2.0], [0.2; 3], UPRIGHT, logit(alpha), shade);
         scenes::push(&mut model, [0.1, 0.0, 3.0], [0.4; 3], UPRIGHT, 0.5, |k| 0.4 * k as f32);
-        trial.check(&format!("alpha {alpha:.9}"), &model, &camera, GREY, 0)?;
+        trial.check(&format!("alpha {alpha:.9}"), &model, &camera, GREEN, 0)?;
     }
     let mut model = scenes::cloud(12, 0, &camera, 8);
     model.opacity_logits.iter_mut().step_by(2).for_each(|logit| *logit = f32::MAX);
-    trial.check("alpha 1", &model, &camera, GREY, 0)?;
+    trial.check("alpha 1", &model, &camera, GREEN, 0)?;
     Ok(())
 }
 
@@ -54,7 +54,7 @@ pub(super) fn layers(trial: &mut Trial<'_>) -> Result<(), BackendError> {
             scenes::push(&mut model, [0.0, 0.0, z], [0.3 * z; 3], UPRIGHT, logit, shade(row));
         }
         let label = format!("{rows} layers");
-        trial.check(&label, &model, &camera, GREY, 0)?;
+        trial.check(&label, &model, &camera, GREEN, 0)?;
         // Black rows on white: the image is the transmittance, with full precision.
         model.sh.fill(-2.0);
         let view = View { camera: &camera, background: [1.0; 3], sh_degree: 0 };
@@ -87,7 +87,7 @@ fn side_by_side(trial: &mut Trial<'_>) -> Result<(), BackendError> {
         let scale = 0.4 * z / camera.fx as f32;
         scenes::push(&mut model, [place[0], place[1], z], [scale; 3], UPRIGHT, -5.0, shade(row));
     }
-    trial.check("100000 Gaussians side by side", &model, &camera, GREY, 0)?;
+    trial.check("100000 Gaussians side by side", &model, &camera, GREEN, 0)?;
     Ok(())
 }
 
@@ -102,7 +102,7 @@ pub(super) fn behind_opaque(trial: &mut Trial<'_>) -> Result<(), BackendError> {
             let place = [0.02 * z, -0.01 * z, z];
             scenes::push(&mut model, place, [0.4 * z; 3], UPRIGHT, logit, shade(row.into()));
         }
-        trial.check(&format!("opacity {opacity} in front of 40"), &model, &camera, GREY, 0)?;
+        trial.check(&format!("opacity {opacity} in front of 40"), &model, &camera, GREEN, 0)?;
     }
     Ok(())
 }
@@ -115,7 +115,7 @@ pub(super) fn logits(trial: &mut Trial<'_>) -> Result<(), BackendError> {
         let camera = scenes::camera(40, 30, 17);
         let mut model = scenes::cloud(12, 0, &camera, 30 + seed as u64);
         model.opacity_logits.iter_mut().step_by(2).for_each(|opacity| *opacity = logit);
-        trial.check(&label, &model, &camera, GREY, 0)?;
+        trial.check(&label, &model, &camera, GREEN, 0)?;
 
         // A single row on a pixel's centre: alpha is the opacity, and the gradient its derivative.
         let camera = axis_camera(17, 17);
@@ -128,23 +128,23 @@ pub(super) fn logits(trial: &mut Trial<'_>) -> Result<(), BackendError> {
         upstream.alpha.fill(0.0);
         let middle = 8 * 17 + 8;
         upstream.alpha[middle] = 1.0;
-        let (image, gradient) = backend.differentiate(&camera, GREY, 0, &upstream)?;
+        let (image, gradient) = backend.differentiate(&camera, GREEN, 0, &upstream)?;
         let opacity = 1.0 / (1.0 + (-f64::from(logit)).exp());
         let (alpha, slope) = match opacity {
             faint if faint < 1.0 / 255.0 => (0.0, 0.0),
             opaque if opaque > 0.99 => (0.99, 0.0),
             between => (between, between * (1.0 - between)),
         };
-        let off = |found: f32, exact: f64| (f64::from(found) - exact).abs() / exact.max(1e-3);
+        let error = |found: f32, exact: f64| (f64::from(found) - exact).abs() / exact.max(1e-3);
         // alpha is 1 − T, and T has an error of 2⁻²⁴ at 1.
         let tolerance = if trial.gradient_tolerance > 1e-4 { 1e-4 } else { 2e-5 };
-        trial.record(&label, "opacity, relative", off(image.alpha[middle], alpha), tolerance);
+        trial.record(&label, "opacity, relative", error(image.alpha[middle], alpha), tolerance);
         let found = gradient.opacity_logits[0];
-        trial.record(&label, "derivative of the opacity, relative", off(found, slope), tolerance);
-        trial.train(&label, &mut *backend, &camera, GREY, 0)?;
+        trial.record(&label, "derivative of the opacity, relative", error(found, slope), tolerance);
+        trial.train(&label, &mut *backend, &camera, GREEN, 0)?;
         let beyond = backend.download()?.opacity_logits.iter().filter(|x| x.abs() > 9.2).count();
         trial.count(&label, "logits beyond 9.2 after a step", beyond);
-        let broken = CLASSES.iter().map(|name| count_broken(&[class(&gradient, name)])).sum();
+        let broken = CLASSES.iter().map(|name| count_non_finite(&[class(&gradient, name)])).sum();
         trial.count(&label, "NaN or infinity", broken);
     }
     Ok(())

@@ -2,11 +2,11 @@
 
 use glam::DVec3;
 
-use super::GREY;
+use super::GREEN;
 use crate::compare::class;
 use crate::reference::CLASSES;
 use crate::scenes;
-use crate::trial::{Trial, count_broken, step};
+use crate::trial::{Trial, count_non_finite, step};
 use densify_core::image::Image8;
 use densify_data::dataset::PointCloud;
 use densify_render::BackendError;
@@ -22,7 +22,7 @@ fn extreme_coefficients(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     for value in [0.0, 1e-30, -1e-30] {
         let mut model = scenes::cloud(16, 3, &camera, 23);
         model.sh[5 * 48..6 * 48].fill(value);
-        trial.check(&format!("coefficients {value:e}"), &model, &camera, GREY, 3)?;
+        trial.check(&format!("coefficients {value:e}"), &model, &camera, GREEN, 3)?;
     }
     // Far beyond any colour: the image and the gradients of other rows stay finite.
     for value in [1e4, -1e4, 1e20, -1e20, 1e38, -1e38] {
@@ -30,16 +30,16 @@ fn extreme_coefficients(trial: &mut Trial<'_>) -> Result<(), BackendError> {
         model.sh[5 * 48..6 * 48].fill(value);
         let upstream = scenes::narrowed(&scenes::upstream(&camera, 5));
         let mut backend = trial.subject.backend(&model)?;
-        let (image, gradient) = backend.differentiate(&camera, GREY, 3, &upstream)?;
-        let mut broken = count_broken(&[&image.rgb, &image.alpha, &image.depth]);
+        let (image, gradient) = backend.differentiate(&camera, GREEN, 3, &upstream)?;
+        let mut broken = count_non_finite(&[&image.rgb, &image.alpha, &image.depth]);
         for name in CLASSES {
             let all = class(&gradient, name);
             let per_row = all.len() / model.len();
-            broken += count_broken(&[&all[..5 * per_row], &all[6 * per_row..]]);
+            broken += count_non_finite(&[&all[..5 * per_row], &all[6 * per_row..]]);
         }
         let label = format!("coefficients {value:e}");
         trial.count(&label, "NaN or infinity", broken);
-        trial.train(&label, &mut *backend, &camera, GREY, 3)?;
+        trial.train(&label, &mut *backend, &camera, GREEN, 3)?;
     }
     Ok(())
 }

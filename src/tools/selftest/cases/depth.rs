@@ -1,6 +1,6 @@
 //! Rows at the camera, around the near plane, and at equal or nearly equal depths.
 
-use super::{GREY, UPRIGHT, axis_camera, flat_colour};
+use super::{GREEN, UPRIGHT, axis_camera, flat_colour};
 use crate::scenes;
 use crate::trial::{Trial, bits, count_different};
 use densify_core::gaussians::Gaussians;
@@ -21,14 +21,14 @@ pub(super) fn near_plane(trial: &mut Trial<'_>) -> Result<(), BackendError> {
         scenes::push(&mut model, mean, scale, [0.8, 0.2, -0.5, 0.1], 0.3, colour);
     }
     model.append(scenes::cloud(20, 1, &camera, 7));
-    trial.check("behind and near", &model, &camera, GREY, 1)?;
+    trial.check("behind and near", &model, &camera, GREEN, 1)?;
 
     // One bit to either side of the plane; without rotation, camera z equals the mean's z exactly.
     let camera = axis_camera(16, 16);
     for z in [NEAR.next_down(), NEAR, NEAR.next_up()] {
         let mut model = Gaussians::default();
         scenes::push(&mut model, [0.0, 0.0, z], [z / 20.0; 3], UPRIGHT, 2.0, flat_colour);
-        let image = trial.subject.backend(&model)?.render(&camera, GREY, 0)?;
+        let image = trial.subject.backend(&model)?.render(&camera, GREEN, 0)?;
         let is_drawn = image.alpha.iter().any(|a| *a > 0.5);
         let wrong = is_drawn != (z > NEAR);
         trial.count(&format!("z = {z:.9}"), "Gaussians on the wrong side", usize::from(wrong));
@@ -47,7 +47,7 @@ pub(super) fn camera_inside(trial: &mut Trial<'_>) -> Result<(), BackendError> {
         let mut back = scenes::cloud(10, 0, &camera, 34);
         back.append(model);
         let label = format!("{times} times as wide as distant");
-        trial.check(&label, &back, &camera, GREY, 0)?;
+        trial.check(&label, &back, &camera, GREEN, 0)?;
     }
     Ok(())
 }
@@ -62,7 +62,7 @@ pub(super) fn camera_at_mean(trial: &mut Trial<'_>) -> Result<(), BackendError> 
             model.log_scales[row] = [0.7, 0.0, 2.0];
         }
         let label = format!("{label} from the camera");
-        let gradient = trial.check_finite(&label, &model, &camera, GREY, 2)?;
+        let gradient = trial.check_finite(&label, &model, &camera, GREEN, 2)?;
         let nonzero = gradient.sh[..3 * 27].iter().filter(|g| **g != 0.0).count();
         trial.count(&label, "gradients of SH without a direction", nonzero);
     }
@@ -74,9 +74,9 @@ pub(super) fn equal_depths(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     let mut model = scenes::cloud(1000, 0, &camera, 45);
     let place = scenes::world(&camera, [0.0, 0.0, 3.0]);
     model.means.fill(place);
-    trial.check("1000 Gaussians at one place", &model, &camera, GREY, 0)?;
+    trial.check("1000 Gaussians at one place", &model, &camera, GREEN, 0)?;
     let upstream = scenes::narrowed(&scenes::upstream(&camera, 12));
-    let run = || trial.subject.backend(&model)?.differentiate(&camera, GREY, 0, &upstream);
+    let run = || trial.subject.backend(&model)?.differentiate(&camera, GREEN, 0, &upstream);
     let first = bits(&run()?);
     let mut different = 0;
     for _ in 0..3 {
@@ -113,7 +113,7 @@ pub(super) fn depth_order(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     for z in [0.0, -0.0, 1e-45, -1e-45, 1e-38, f32::MIN_POSITIVE] {
         let mut model = Gaussians::default();
         scenes::push(&mut model, [0.0, 0.0, z], [1e-3; 3], UPRIGHT, 4.0, flat_colour);
-        let image = trial.subject.backend(&model)?.render(&camera, GREY, 0)?;
+        let image = trial.subject.backend(&model)?.render(&camera, GREEN, 0)?;
         drawn += image.alpha.iter().filter(|a| **a != 0.0).count();
     }
     trial.count("depths around zero", "pixels of Gaussians that are too near", drawn);

@@ -7,18 +7,18 @@ use crate::compare::relative_error;
 use crate::reference::loss::{Loss, loss};
 use crate::scenes;
 use crate::subject::Subject;
-use crate::trial::{Trial, count_broken, step};
+use crate::trial::{Trial, count_non_finite, step};
 use crate::values::SIZES;
 use densify_core::camera::Camera;
 use densify_core::gaussians::Gaussians;
 use densify_core::image::Image8;
 use densify_render::{BackendError, Differentiable};
 
-/// Size of the images `[px]`, except those of the table of sizes.
+/// Size of the images `[px]`, except those of [`SIZES`].
 const SIZE: (u32, u32) = (48, 40);
 
 /// Tolerances of the loss, L1 and SSIM, and of the gradient relative to its largest value. Flat images are the
-/// least accurate, as C₂ is small beside the rounding of their squares.
+/// least accurate, because C₂ is small compared with the rounding errors of their squares.
 fn tolerances(subject: &Subject) -> (f64, f64) {
     match subject {
         Subject::Gpu(_) => (2e-6, 1e-4),
@@ -93,10 +93,10 @@ pub(super) fn uniform_photographs(trial: &mut Trial<'_>) -> Result<(), BackendEr
         let rendered = vec![f32::from(value) * (1.0 / 255.0); target.rgb.len()];
         let (found, gradient) =
             backend.loss(&scenes::opaque(&rendered, &target), &target, [0.0; 3])?;
-        let off = f64::from(found.loss.abs().max((1.0 - found.ssim).abs()));
+        let error = f64::from(found.loss.abs().max((1.0 - found.ssim).abs()));
         // A GPU's division by 255 is accurate to 2.5 units in the last place.
         let tolerance = if matches!(trial.subject, Subject::Gpu(_)) { 3e-7 } else { 0.0 };
-        trial.record(&label, "loss of equal images", off, tolerance);
+        trial.record(&label, "loss of equal images", error, tolerance);
         if tolerance == 0.0 {
             let nonzero = gradient.iter().filter(|g| g.abs() > 1e-12).count();
             trial.count(&label, "gradients of equal images", nonzero);
@@ -109,7 +109,7 @@ pub(super) fn uniform_photographs(trial: &mut Trial<'_>) -> Result<(), BackendEr
     let mut backend = trial.subject.backend(&model)?;
     let output = step(&mut *backend, 1, &away, &flat_image(255), [1.0; 3], 0)?;
     let mut moved = usize::from(backend.download()?.means != model.means);
-    moved += count_broken(&[&[output.loss, output.ssim]]) + output.visible;
+    moved += count_non_finite(&[&[output.loss, output.ssim]]) + output.visible;
     trial.count("an empty view", "Gaussians moved", moved);
     Ok(())
 }

@@ -18,7 +18,8 @@ use glam::{DMat3, DVec3};
 use super::Case;
 use densify_core::camera::Camera;
 
-const GREY: [f32; 3] = [0.2, 0.5, 0.3];
+/// Background of most cases.
+const GREEN: [f32; 3] = [0.2, 0.5, 0.3];
 /// No rotation.
 const UPRIGHT: [f32; 4] = [1.0, 0.0, 0.0, 0.0];
 

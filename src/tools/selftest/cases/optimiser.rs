@@ -26,7 +26,7 @@ pub(super) fn moments(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     // A camera that sees nothing, so that there is no gradient.
     let away = Camera { translation: glam::DVec3::new(0.0, 0.0, -1e3), ..camera };
     let mut model = scenes::cloud(GRADIENTS.len(), 3, &camera, 28);
-    // Equal parameters, so that rounding is the same, and far from the limits of parameters.
+    // All parameters of a kind are equal, so that they are rounded alike, and far from their limits.
     model.means.as_flattened_mut().fill(0.5);
     model.log_scales.as_flattened_mut().fill(-1.0);
     model.opacity_logits.fill(0.5);
@@ -68,10 +68,10 @@ pub(super) fn moments(trial: &mut Trial<'_>) -> Result<(), BackendError> {
         }
     }
     // The audit reports exactly the row whose moment overflows.
-    let found = backend.audit()?;
+    let audit = backend.audit()?;
     let is_expected =
         |u: &densify_render::NonFinite| u.row == OVERFLOWING && u.kind == NumberKind::Moment;
-    let wrong = usize::from(found.is_empty()) + found.iter().filter(|u| !is_expected(u)).count();
+    let wrong = usize::from(audit.is_empty()) + audit.iter().filter(|u| !is_expected(u)).count();
     trial.count("gradient 1e30", "Gaussians missed or wrongly reported by the audit", wrong);
     let mut plan = EditPlan::new(backend.rows(), backend.budget());
     let _ = plan.prune(OVERFLOWING);

@@ -1,10 +1,10 @@
 //! Rows that hold NaN, infinity or extreme numbers, among sound ones.
 
-use super::GREY;
+use super::GREEN;
 use crate::compare::class;
 use crate::reference::CLASSES;
 use crate::scenes;
-use crate::trial::{Trial, count_broken, count_different};
+use crate::trial::{Trial, count_different, count_non_finite};
 use crate::values::{EXTREMES, POISON, SLOTS, remove, slot_mut, slot_name};
 use densify_core::gaussians::Gaussians;
 use densify_render::{BackendError, Differentiable};
@@ -26,7 +26,8 @@ pub(super) fn poisoned(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     let camera = scenes::camera(49, 40, 19);
     let model = scenes::cloud(SOUND, 3, &camera, 32);
     let upstream = scenes::narrowed(&scenes::upstream(&camera, 5));
-    let run = |backend: &mut dyn Differentiable| backend.differentiate(&camera, GREY, 3, &upstream);
+    let run =
+        |backend: &mut dyn Differentiable| backend.differentiate(&camera, GREEN, 3, &upstream);
     // The bits of the image and of the gradients of the sound rows.
     let bits = |backend: &mut dyn Differentiable| -> Result<Vec<u32>, BackendError> {
         let (image, gradient) = run(backend)?;
@@ -45,9 +46,9 @@ pub(super) fn poisoned(trial: &mut Trial<'_>) -> Result<(), BackendError> {
         let mut backend = trial.subject.backend(&poisoned)?;
         let different = count_different(&bits(&mut *backend)?, &clean);
         trial.count(&label, "bits of other Gaussians and of pixels changed", different);
-        let found: Vec<usize> = backend.audit()?.iter().map(|u| u.row as usize).collect();
+        let reported: Vec<usize> = backend.audit()?.iter().map(|u| u.row as usize).collect();
         let expected: Vec<usize> = (SOUND..SOUND + SLOTS).collect();
-        let is_wrong = usize::from(found != expected);
+        let is_wrong = usize::from(reported != expected);
         trial.count(&label, "Gaussians missed or wrongly reported by the audit", is_wrong);
     }
     // Finite numbers may be rendered, and change the image; all results stay finite.
@@ -57,18 +58,18 @@ pub(super) fn poisoned(trial: &mut Trial<'_>) -> Result<(), BackendError> {
         let mut backend = trial.subject.backend(&extreme)?;
         let (image, gradient) = run(&mut *backend)?;
         let label = format!("{value:e} in every parameter");
-        let broken = count_broken(&[&image.rgb, &image.alpha, &image.depth]);
+        let broken = count_non_finite(&[&image.rgb, &image.alpha, &image.depth]);
         trial.count(&label, "NaN or infinity in the image", broken);
         for name in CLASSES {
             let all = class(&gradient, name);
             let per_row = all.len() / extreme.len();
-            let broken = count_broken(&[&all[..per_row * (SOUND - 1)]]);
+            let broken = count_non_finite(&[&all[..per_row * (SOUND - 1)]]);
             trial.count(&label, "NaN or infinity in the gradients of others", broken);
             for slot in 0..SLOTS {
                 let row = SOUND - 1 + slot;
                 let own = &all[row * per_row..(row + 1) * per_row];
                 let label = format!("{value:e} in {}", slot_name(slot));
-                trial.count(&label, "NaN or infinity in its own gradient", count_broken(&[own]));
+                trial.count(&label, "NaN or infinity in its gradient", count_non_finite(&[own]));
             }
         }
     }

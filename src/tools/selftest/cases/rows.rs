@@ -2,11 +2,11 @@
 
 use densify_policies::plan::EditPlan;
 
-use super::{GREY, UPRIGHT, axis_camera, flat_colour, shade};
+use super::{GREEN, UPRIGHT, axis_camera, flat_colour, shade};
 use crate::compare::class;
 use crate::reference::CLASSES;
 use crate::scenes;
-use crate::trial::{Trial, count_broken, step};
+use crate::trial::{Trial, count_non_finite, step};
 use densify_core::gaussians::Gaussians;
 use densify_render::{BackendError, Setup};
 
@@ -31,7 +31,7 @@ pub(super) fn no_row(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     let target = scenes::target(&camera);
     let output = step(&mut *backend, 1, &camera, &target, BACKGROUND, 2)?;
     backend.apply(&EditPlan::new(0, 3).compile(), 1, 1)?;
-    let unsound = backend.audit()?.len() + count_broken(&[&[output.loss, output.ssim]]);
+    let unsound = backend.audit()?.len() + count_non_finite(&[&[output.loss, output.ssim]]);
     let broken = backend.rows() + unsound;
     trial.count("0 Gaussians", "Gaussians or broken numbers after a step and an edit", broken);
     Ok(())
@@ -42,7 +42,7 @@ pub(super) fn one_row(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     for scale in [0.01, 0.1, 1.0] {
         let mut model = Gaussians::default();
         scenes::push(&mut model, [0.0, 0.0, 2.0], [scale; 3], UPRIGHT, 0.0, flat_colour);
-        trial.check(&format!("standard deviation {scale}"), &model, &camera, GREY, 0)?;
+        trial.check(&format!("standard deviation {scale}"), &model, &camera, GREEN, 0)?;
     }
     Ok(())
 }
@@ -55,7 +55,7 @@ pub(super) fn duplicates(trial: &mut Trial<'_>) -> Result<(), BackendError> {
         for row in 0..rows {
             scenes::push(&mut model, place, [0.3, 0.2, 0.4], UPRIGHT, -2.0, shade(row));
         }
-        trial.check(&format!("{rows} Gaussians"), &model, &camera, GREY, 0)?;
+        trial.check(&format!("{rows} Gaussians"), &model, &camera, GREEN, 0)?;
     }
     Ok(())
 }

@@ -1,9 +1,9 @@
 //! Rows of every shape and size, in general position and far outside the frustum.
 
-use super::{GREY, axis_camera, flat_colour};
+use super::{GREEN, axis_camera, flat_colour};
 use crate::compare::relative_error;
 use crate::scenes;
-use crate::trial::{Trial, count_broken};
+use crate::trial::{Trial, count_non_finite};
 use densify_core::camera::Camera;
 use densify_core::gaussians::Gaussians;
 use densify_render::BackendError;
@@ -32,12 +32,12 @@ pub(super) fn scales(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     // exp(−43.7)² is the smallest normal number; training clamps standard deviations at exp(2.3).
     for value in [-80.0, -43.7, -30.0, -20.0, 0.0, 2.3] {
         let label = format!("log-scale {value}");
-        trial.check(&label, &cloud_of_scale(&camera, value), &camera, GREY, 0)?;
+        trial.check(&label, &cloud_of_scale(&camera, value), &camera, GREEN, 0)?;
     }
     // Squares and determinants exceed f32: no accuracy is required, but all numbers stay finite.
     for value in [12.0, 20.0, 44.0, 60.0, 88.0, 89.0, 120.0] {
         let label = format!("log-scale {value}");
-        trial.check_finite(&label, &cloud_of_scale(&camera, value), &camera, GREY, 0)?;
+        trial.check_finite(&label, &cloud_of_scale(&camera, value), &camera, GREEN, 0)?;
     }
     Ok(())
 }
@@ -57,16 +57,16 @@ pub(super) fn quaternions(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     for length in [1e-15_f32, 1e-8, 1e-5, 1.0, 1e6, 1e18] {
         let label = format!("length {length:e}");
         let model = scaled(length);
-        trial.check(&label, &model, &camera, GREY, 0)?;
+        trial.check(&label, &model, &camera, GREEN, 0)?;
         // The rotation does not depend on the length, so the gradient along it is zero.
         let upstream = scenes::narrowed(&scenes::upstream(&camera, 5));
         let mut backend = trial.subject.backend(&model)?;
-        let (_, gradient) = backend.differentiate(&camera, GREY, 0, &upstream)?;
-        let wide = |q: &[f32; 4]| q.map(f64::from);
+        let (_, gradient) = backend.differentiate(&camera, GREEN, 0, &upstream)?;
+        let to_f64 = |q: &[f32; 4]| q.map(f64::from);
         let norm = |q: [f64; 4]| q.iter().map(|v| v * v).sum::<f64>().sqrt();
-        let largest = gradient.quats.iter().map(|g| norm(wide(g))).fold(0.0, f64::max);
+        let largest = gradient.quats.iter().map(|g| norm(to_f64(g))).fold(0.0, f64::max);
         let along = model.quats.iter().zip(&gradient.quats).map(|(q, g)| {
-            let (q, g) = (wide(q), wide(g));
+            let (q, g) = (to_f64(q), to_f64(g));
             q.iter().zip(g).map(|(q, g)| q * g).sum::<f64>().abs() / norm(q)
         });
         let radial = along.fold(0.0, f64::max) / largest;
@@ -78,9 +78,9 @@ pub(super) fn quaternions(trial: &mut Trial<'_>) -> Result<(), BackendError> {
         let mut model = scaled(1.0);
         model.quats[3] = [0.5 * length; 4];
         let mut backend = trial.subject.backend(&model)?;
-        let image = backend.render(&camera, GREY, 0)?;
-        trial.count(&label, "NaN or infinity", count_broken(&[&image.rgb, &image.depth]));
-        trial.train(&label, &mut *backend, &camera, GREY, 0)?;
+        let image = backend.render(&camera, GREEN, 0)?;
+        trial.count(&label, "NaN or infinity", count_non_finite(&[&image.rgb, &image.depth]));
+        trial.train(&label, &mut *backend, &camera, GREEN, 0)?;
         // `train` pruned the first row, so row 3 is now row 2.
         let upright = backend.download()?.quats[2][0] > 0.99;
         trial.count(&label, "Gaussians whose zero quaternion was not reset", usize::from(!upright));
@@ -99,18 +99,18 @@ pub(super) fn needles(trial: &mut Trial<'_>) -> Result<(), BackendError> {
         for turn in 0..16 {
             let label = format!("{sigma_px} px, turn {turn}");
             let model = needle(sigma_px, turn);
-            let (measured, expected) = trial.check(&label, &model, &camera, GREY, 0)?;
+            let (measured, expected) = trial.check(&label, &model, &camera, GREEN, 0)?;
             let log_scales = measured.log_scales[0].map(f64::from);
             let found = by_covariance(&model, log_scales, measured.quats[0].map(f64::from));
             let exact = by_covariance(&model, expected.log_scales[0], expected.quats[0]);
-            trial.record(&label, "by covariance", relative_error(&found, &exact), 1e-3);
+            trial.record(&label, "covariance gradient", relative_error(&found, &exact), 1e-3);
         }
     }
     // The exponent may be off by 1e-2 here, and alpha with it.
     trial.limits.interior = 1e-2;
     for turn in 0..16 {
         let label = format!("10000 px, turn {turn}");
-        trial.check_image(&label, &needle(1e4, turn), &camera, GREY, 0)?;
+        trial.check_image(&label, &needle(1e4, turn), &camera, GREEN, 0)?;
     }
     Ok(())
 }

@@ -1,9 +1,9 @@
 //! Awkward image sizes, extreme lenses, and rows that fill the image.
 
-use super::{GREY, UPRIGHT, axis_camera, shade};
+use super::{GREEN, UPRIGHT, axis_camera, shade};
 use crate::reference::{Model, Rules, View, blend, project};
 use crate::scenes;
-use crate::trial::{Trial, count_broken, step};
+use crate::trial::{Trial, count_non_finite, step};
 use crate::values::{LARGE_SIZES, SIZES};
 use densify_core::camera::Camera;
 use densify_core::gaussians::Gaussians;
@@ -20,22 +20,22 @@ pub(super) fn images(trial: &mut Trial<'_>) -> Result<(), BackendError> {
         trial.check(&label, &model, &camera, BACKGROUNDS[seed % 3], 1)?;
     }
     for (width, height) in LARGE_SIZES {
-        large(trial, width, height)?;
+        check_large_image(trial, width, height)?;
     }
     Ok(())
 }
 
 /// Compares some pixels with the reference: at corners, at the borders of tiles, and spread over the image.
-fn large(trial: &mut Trial<'_>, width: u32, height: u32) -> Result<(), BackendError> {
+fn check_large_image(trial: &mut Trial<'_>, width: u32, height: u32) -> Result<(), BackendError> {
     let camera = scenes::camera(width, height, 60);
     let model = scenes::cloud(40, 1, &camera, 61);
     let label = format!("{width}x{height}");
-    let image = match trial.subject.backend(&model)?.render(&camera, GREY, 1) {
+    let image = match trial.subject.backend(&model)?.render(&camera, GREEN, 1) {
         // A device with small buffers does not support such an image; there is nothing to compare.
         Err(BackendError::BufferTooLarge { .. }) => return Ok(()),
         other => other?,
     };
-    let view = View { camera: &camera, background: GREY.map(f64::from), sh_degree: 1 };
+    let view = View { camera: &camera, background: GREEN.map(f64::from), sh_degree: 1 };
     let splats = project::project(&Model::from(&model), view, &Rules::STANDARD);
     let order = project::by_depth(&splats);
     let ends = |size: u32| [0, 15, 16, size / 2, size - 17, size - 16, size - 1];
@@ -46,11 +46,11 @@ fn large(trial: &mut Trial<'_>, width: u32, height: u32) -> Result<(), BackendEr
         let exact = blend::render_pixel(&splats, &order, view, &Rules::STANDARD, [x, y]);
         let at = 3 * (y as usize * width as usize + x as usize);
         for (found, exact_value) in image.rgb[at..at + 3].iter().zip(exact.rgb) {
-            let off = (f64::from(*found) - exact_value).abs();
-            worst = if off.is_nan() || exact.boundary { worst } else { worst.max(off) };
+            let error = (f64::from(*found) - exact_value).abs();
+            worst = if error.is_nan() || exact.boundary { worst } else { worst.max(error) };
         }
     }
-    let broken = count_broken(&[&image.rgb, &image.alpha, &image.depth]);
+    let broken = count_non_finite(&[&image.rgb, &image.alpha, &image.depth]);
     trial.count(&label, "NaN or infinity", broken);
     let tolerance = trial.limits.interior;
     trial.record(&format!("{label}: rgb of 549 pixels"), "image", worst, tolerance);
@@ -100,7 +100,7 @@ pub(super) fn large_rows(trial: &mut Trial<'_>) -> Result<(), BackendError> {
         let tile_cap = Some(front.len() * TILES as usize);
         let mut backend =
             trial.subject.backend_with(&front, Setup { tile_cap, ..Setup::default() })?;
-        backend.render(&camera, GREY, 0)?
+        backend.render(&camera, GREEN, 0)?
     };
     let all = model(rows);
     let target = scenes::target(&camera);
@@ -108,7 +108,7 @@ pub(super) fn large_rows(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     let largest_image = (camera.width, camera.height);
     let setup = Setup { largest_image, tile_cap, ..Setup::default() };
     let mut backend = trial.subject.backend_with(&all, setup)?;
-    let output = step(&mut *backend, 1, &camera, &target, GREY, 0)?;
+    let output = step(&mut *backend, 1, &camera, &target, GREEN, 0)?;
     if let (Some(before), Some(after), true) = (before, resident(), trial.is_memory_measurable()) {
         let used = after.saturating_sub(before) as f64 / backend.ledger().total() as f64;
         trial.record(&label, "memory used, relative to the ledger", used, 1.1);
@@ -120,7 +120,7 @@ pub(super) fn large_rows(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     trial.count(&label, "NaN or infinity", broken);
     drop(backend);
     let mut backend = trial.subject.backend_with(&all, Setup { tile_cap, ..Setup::default() })?;
-    let image = backend.render(&camera, GREY, 0)?;
+    let image = backend.render(&camera, GREEN, 0)?;
     let pairs = image.rgb.iter().zip(&expected.rgb).chain(image.depth.iter().zip(&expected.depth));
     let different = pairs.filter(|(a, b)| a.to_bits() != b.to_bits()).count();
     trial.count(&label, "bits that differ from the front Gaussians alone", different);

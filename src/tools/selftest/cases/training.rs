@@ -9,7 +9,7 @@ use glam::{DMat3, DVec3};
 use super::UPRIGHT;
 use crate::scenes;
 use crate::subject::Subject;
-use crate::trial::{Trial, count_broken};
+use crate::trial::{Trial, count_non_finite};
 use densify_core::camera::Camera;
 use densify_core::gaussians::Gaussians;
 use densify_core::image::{Image8, SharedImage};
@@ -81,7 +81,7 @@ fn blobs() -> Gaussians {
 }
 
 fn photographs() -> Result<Photographs, BackendError> {
-    // The native backend, so that every backend trains on the same photographs.
+    // The native backend renders them, so that every backend trains on the same photographs.
     let mut native = Subject::NATIVE.backend(&blobs())?;
     let cameras = cameras();
     let mut images = Vec::new();
@@ -101,7 +101,7 @@ fn count_out_of_range(model: &Gaussians) -> usize {
     let quats = model.quats.iter().filter(|q| outside(&norm(q), 0.5, 2.0)).count();
     let logits = model.opacity_logits.iter().filter(|x| outside(x, -9.2, 9.2)).count();
     let scales = model.log_scales.as_flattened().iter().filter(|x| outside(x, -13.8, 2.3)).count();
-    quats + logits + scales + count_broken(&[model.means.as_flattened(), &model.sh])
+    quats + logits + scales + count_non_finite(&[model.means.as_flattened(), &model.sh])
 }
 
 pub(super) fn run(trial: &mut Trial<'_>) -> Result<(), BackendError> {

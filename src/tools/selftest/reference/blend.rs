@@ -19,8 +19,9 @@ struct Contribution {
 /// The rows blended into one pixel, front to back.
 struct Pixel {
     contributions: Vec<Contribution>,
+    /// Transmittance behind the last of them.
     transmittance: f64,
-    /// A threshold was close.
+    /// True if a threshold was close.
     boundary: bool,
 }
 
@@ -92,7 +93,7 @@ pub struct Sample {
     pub transmittance: f64,
     /// Number of rows blended.
     pub blended: u32,
-    /// A threshold was close.
+    /// True if a threshold was close.
     pub boundary: bool,
 }
 
@@ -199,7 +200,7 @@ pub fn backward(
     gradient
 }
 
-/// Adds the gradient of the exponent p in alpha = opacity · exp(−p).
+/// Adds what the exponent p in alpha = opacity · exp(−p) contributes to the gradients of the mean and the conic.
 fn add_exponent(sum: &mut ScreenGradient, splat: &Splat, hit: &Contribution, d_exponent: f64) {
     let [dx, dy] = hit.offset;
     let [a, b, c] = splat.conic;

@@ -14,7 +14,7 @@ pub struct Loss {
     pub l1: f64,
     /// Mean SSIM.
     pub ssim: f64,
-    /// Shape: [height, width, 3].
+    /// dL/d(rendered). Shape: [height, width, 3].
     pub gradient: Vec<f64>,
     /// Absolute error and 1 − SSIM of each pixel, means over channels.
     pub by_pixel: Vec<[f64; 2]>,

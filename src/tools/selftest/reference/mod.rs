@@ -60,7 +60,7 @@ pub struct Model {
     pub sh: Vec<f64>,
 }
 
-/// Names of the parameter classes; stored arrays have the same names.
+/// Names of the parameter classes; the stored arrays of the oracle have the same names.
 pub const CLASSES: [&str; 5] = ["means", "log_scales", "quats", "opacity_logits", "sh"];
 
 impl From<&Gaussians> for Model {
@@ -147,7 +147,7 @@ impl Model {
 /// A view to render: camera, background and SH degree.
 #[derive(Debug, Clone, Copy)]
 pub struct View<'a> {
-    /// Camera.
+    /// Camera to render from.
     pub camera: &'a Camera,
     /// Background colour.
     pub background: [f64; 3],

@@ -19,7 +19,7 @@ pub struct Splat {
     pub conic: [f64; 3],
     /// Colour before the clamp at 0.
     pub colour: [f64; 3],
-    /// The row's own opacity in (0, 1).
+    /// The row's opacity before antialiasing, in (0, 1).
     pub own_opacity: f64,
     /// ρ² = det S/det C with antialiasing, else 1; C is the projected covariance, and S the same without blur.
     pub rho2: f64,
@@ -37,9 +37,11 @@ struct Geometry {
     clamped: [bool; 2],
     /// Camera rotation.
     rotation: DMat3,
-    /// Rotation times scale: covariance = m·mᵀ.
+    /// Rotation of the row times its scale: covariance = m·mᵀ.
     m: DMat3,
+    /// Rotation of the row.
     axes: DMat3,
+    /// Standard deviations along its axes `[scene units]`.
     scale: DVec3,
 }
 
@@ -233,7 +235,7 @@ fn rotation_of(q: [f64; 4]) -> DMat3 {
     DMat3::from_cols_array_2d(&columns)
 }
 
-/// `d_columns[j][i]` is the gradient of entry (i, j).
+/// Gradient of a quaternion from that of its rotation matrix: `d_columns[j][i]` belongs to entry (i, j).
 fn rotation_backward(q: [f64; 4], d_columns: [DVec3; 3]) -> [f64; 4] {
     let length = norm(q);
     let unit = q.map(|v| v / length);

@@ -109,8 +109,8 @@ fn choose_window(
 fn enlarge(picture: &RgbImage, window: Window) -> RgbImage {
     let crop = window.crop(picture);
     let (width, height) = crop.dimensions();
-    let times = MIN_WIDTH.div_ceil(width);
-    imageops::resize(&crop, width * times, height * times, imageops::FilterType::Nearest)
+    let factor = MIN_WIDTH.div_ceil(width);
+    imageops::resize(&crop, width * factor, height * factor, imageops::FilterType::Nearest)
 }
 
 #[cfg(test)]
@@ -119,13 +119,13 @@ mod tests {
 
     #[test]
     fn crops_are_enlarged_by_whole_numbers() {
-        for ((width, height), shown) in [((40, 24), (480, 288)), ((2000, 700), (480, 480))] {
+        for ((width, height), enlarged) in [((40, 24), (480, 288)), ((2000, 700), (480, 480))] {
             let picture = RgbImage::new(width, height);
             let (_, window) = Window::with_most_edges(&picture);
             let crop = enlarge(&picture, window);
-            assert_eq!(crop.dimensions(), shown);
+            assert_eq!(crop.dimensions(), enlarged);
             let pair = side_by_side(&[crop.clone(), crop], GAP);
-            assert_eq!(pair.dimensions(), (2 * shown.0 + GAP, shown.1));
+            assert_eq!(pair.dimensions(), (2 * enlarged.0 + GAP, enlarged.1));
         }
     }
 }

@@ -29,7 +29,7 @@ const OWN_OPTIONS: [&str; 8] =
     ["scene", "policy", "budget", "seed", "iterations", "output", "test_iterations", "view"];
 /// The name that stands for all policies.
 const ALL: &str = "all";
-/// Evaluations during each run, for the curves.
+/// Number of evaluations during each run, for the curves.
 const EVALUATIONS: u32 = 8;
 
 const EXAMPLES: &str = "\
@@ -148,14 +148,14 @@ impl Comparison {
         require_unique(&self.budget, "--budget")?;
         let labels = labels(&self.scenes)?;
         let budgets = budgets(&self.budget, &labels)?;
-        let least = budgets.iter().flatten().copied().min().unwrap_or(1);
+        let smallest = budgets.iter().flatten().copied().min().unwrap_or(1);
         let variants: Vec<PolicyVariant<'_>> =
             policies.iter().map(|policy| PolicyVariant::parse(policy)).collect();
         for variant in &variants {
-            variant.check(least, self.iterations)?;
+            variant.check(smallest, self.iterations)?;
         }
-        let tests = (1..EVALUATIONS).map(|i| i64::from((self.iterations * i / EVALUATIONS).max(1)));
-        let shared = Partial::option("test_iterations", tests.map(Value::from).collect::<Vec<_>>())
+        let steps = (1..EVALUATIONS).map(|i| i64::from((self.iterations * i / EVALUATIONS).max(1)));
+        let shared = Partial::option("test_iterations", steps.map(Value::from).collect::<Vec<_>>())
             .over(shared);
         let mut runs = Vec::new();
         for seed in 0..self.seeds {
@@ -222,7 +222,7 @@ fn budgets(given: &[SceneBudget], labels: &[String]) -> Result<Vec<Vec<usize>>, 
         let rows = if own.is_empty() { rows_for(None) } else { own };
         if rows.is_empty() {
             return Err(Failure::input(format!(
-                "--budget has none for {label}; add {label}=ROWS, or ROWS for all scenes"
+                "--budget gives no budget for {label}; add {label}=ROWS, or ROWS for all scenes"
             )));
         }
         Ok(rows)
@@ -281,8 +281,8 @@ mod tests {
         assert_eq!(expanded("vanilla,all"), Ok([&*vanilla, &others].concat()));
         assert_eq!(expanded("all,vanilla"), Ok([&*others, &vanilla].concat()));
         // A policy with parameters is an additional one.
-        let with = expanded("diet:rho=0,all").expect("they are known");
-        assert_eq!((with[0].as_str(), with[1..].to_vec()), ("diet:rho=0", names().collect()));
+        let all = expanded("diet:rho=0,all").expect("they are known");
+        assert_eq!((all[0].as_str(), all[1..].to_vec()), ("diet:rho=0", names().collect()));
         assert!(expanded("all,diet,all").is_err_and(|message| message.contains("all twice")));
     }
 

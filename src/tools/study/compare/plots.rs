@@ -85,7 +85,7 @@ fn growth(
     let mut records = BTreeMap::new();
     for run in policies.iter().filter_map(|policy| first_run(policy)) {
         let steps = steps_of(&output.join("runs").join(&run.run)).unwrap_or_else(|error| {
-            observer.say(format_args!("note: {error}; its curves are left out"));
+            observer.say(format_args!("note: {error}; the curves of this run are left out"));
             Vec::new()
         });
         records.insert(&run.run, steps);

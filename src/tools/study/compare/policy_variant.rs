@@ -20,7 +20,7 @@ impl<'a> PolicyVariant<'a> {
         Self { name: parts.next().unwrap_or_default(), settings: parts.collect() }
     }
 
-    /// Parameters by name.
+    /// Values of the parameters, by name.
     fn parameters(&self) -> Result<Table, Failure> {
         let mut parameters = Table::new();
         let malformed = |error: String| Failure::input(format!("--policies: {error}"));
@@ -42,7 +42,7 @@ impl<'a> PolicyVariant<'a> {
         Partial::option("policy_set", settings).over(Partial::option("policy", self.name))
     }
 
-    /// Name for folders.
+    /// The policy and its parameters as part of a folder's name.
     pub(super) fn folder(&self) -> String {
         let is_plain = |c: char| c.is_ascii_alphanumeric() || "._-".contains(c);
         [&[self.name], &self.settings[..]].concat().join("-").replace(|c| !is_plain(c), "-")

@@ -10,7 +10,7 @@ struct Score {
     title: &'static str,
     value: fn(&Outcome) -> f64,
     digits: usize,
-    /// Lower is better.
+    /// True if lower values are better.
     is_error: bool,
 }
 

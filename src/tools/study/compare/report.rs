@@ -209,9 +209,9 @@ mod tests {
         assert!(text.contains("1,001 **over the budget: not ranked**"), "{text}");
         assert!(!text.contains("Geometry"), "{text}");
         let text = summary(&all, &policies);
-        let of_c = "   –  c               –                        –     –       –     –     0  (2 more over";
+        let row_of_c = "   –  c               –                        –     –       –     –     0  (2 more over";
         assert!(
-            text.contains(of_c) && text.contains("b          31.500  +0.50, two runs"),
+            text.contains(row_of_c) && text.contains("b          31.500  +0.50, two runs"),
             "{text}"
         );
         assert!(text.contains("policy  1,000: end          peak"), "{text}");

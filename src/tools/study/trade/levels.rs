@@ -10,7 +10,7 @@ use densify_run::{Observer, Partial, RunOption};
 #[derive(Debug, Clone)]
 pub(super) struct Factor {
     pub(super) name: String,
-    /// The factor must not change the model at all.
+    /// True if the factor must not change the model at all.
     pub(super) is_exact: bool,
     /// Levels to try, besides the level in the preset `exact`.
     pub(super) levels: Vec<String>,
@@ -75,7 +75,7 @@ pub(super) fn factors(
     Ok(factors)
 }
 
-/// The knob or option of this name at the given levels, or else its default levels.
+/// The knob or option of this name at the given levels, or at its default levels if none are given.
 ///
 /// # Errors
 /// If a run would refuse the option or a level.

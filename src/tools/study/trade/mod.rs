@@ -144,8 +144,9 @@ fn with_level(base: &PlannedRun, factor: &str, level: &str) -> PlannedRun {
 fn settings(factor: &str, level: &str, iterations: u32) -> Vec<(String, String)> {
     let setting = |&(name, value): &(&str, &str)| {
         let value = match (name, value.parse::<u64>()) {
-            ("iterations", Ok(own)) => {
-                let scaled = own * u64::from(iterations) / u64::from(REFERENCE_ITERATIONS);
+            ("iterations", Ok(preset_iterations)) => {
+                let scaled =
+                    preset_iterations * u64::from(iterations) / u64::from(REFERENCE_ITERATIONS);
                 scaled.max(1).to_string()
             }
             _ => value.to_owned(),

@@ -23,7 +23,7 @@ struct Point {
     psnr: f64,
     /// Peak memory `[MiB]`.
     peak: f64,
-    /// No other point is both faster and better.
+    /// True if no other point is both faster and better.
     is_optimal: bool,
 }
 
@@ -104,9 +104,9 @@ fn draw_points(
     for point in points {
         let at = (point.seconds, point.psnr);
         let filled = colour(point.peak, peaks).filled();
-        let (radius, ink) =
+        let (radius, text_colour) =
             if point.is_optimal { (6, BLACK) } else { (4, RGBColor(120, 120, 120)) };
-        let font = ("sans-serif", 11).into_font().color(&ink);
+        let font = ("sans-serif", 11).into_font().color(&text_colour);
         let label = Text::new(point.name.clone(), (9, -5), font);
         let element = EmptyElement::at(at) + Circle::new((0, 0), radius, filled) + label;
         chart.draw_series([element])?;

@@ -25,7 +25,7 @@ pub(super) fn document(results: &Results) -> Document {
         text = text.plain(" Options of every run: ").code(&train.join(" ")).plain(".");
     }
     let differences = format!(
-        " with the same scene and seed; ratios are geometric means. {INTERVALS}. Scores are of views held out, \
+        " with the same scene and seed; ratios are geometric means. {INTERVALS}. Scores are those of held-out views, \
          rendered without any shortcut."
     );
     document.paragraph(text.plain(" Differences are from ").code("exact").plain(&differences));

@@ -92,7 +92,7 @@ impl Results {
         })
     }
 
-    /// Mean over the runs with a factor at a level in a scene.
+    /// Mean of a quantity over the runs with a factor at a level in a scene; `None` if any run did not measure it.
     pub(super) fn mean(
         &self,
         scene: &str,
@@ -119,12 +119,12 @@ pub(super) fn sample() -> Results {
         ..crate::outcome::sample(factor, level, seed, psnr)
     };
     let outcomes = (0..3).flat_map(|seed| {
-        let by = f64::from(seed);
+        let offset = f64::from(seed);
         [
-            outcome("", "", seed, 30.0 + by, 100.0),
-            outcome("alpha_min", "1/64", seed, 30.0 + by, 90.0),
-            outcome("alpha_min", "1/32", seed, 29.0 + 1.1 * by, 95.0),
-            outcome("sh_degree", "0", seed, 30.2 + by, 50.0),
+            outcome("", "", seed, 30.0 + offset, 100.0),
+            outcome("alpha_min", "1/64", seed, 30.0 + offset, 90.0),
+            outcome("alpha_min", "1/32", seed, 29.0 + 1.1 * offset, 95.0),
+            outcome("sh_degree", "0", seed, 30.2 + offset, 50.0),
         ]
     });
     let study = Trade {

@@ -43,6 +43,7 @@ pub(super) fn serve_connection(
     }
 }
 
+/// The next request of a connection, or the reason why there is none.
 enum Next {
     Request(Request),
     Refused(Response),

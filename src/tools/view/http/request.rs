@@ -109,9 +109,9 @@ pub(super) fn parse(bytes: &[u8]) -> Result<Option<Head>, Response> {
 
 /// The value of a header that may occur at most once.
 fn header(headers: &[httparse::Header<'_>], name: &str) -> Result<Option<String>, Response> {
-    let mut found = headers.iter().filter(|header| header.name.eq_ignore_ascii_case(name));
-    let first = found.next();
-    if found.next().is_some() {
+    let mut matching = headers.iter().filter(|header| header.name.eq_ignore_ascii_case(name));
+    let first = matching.next();
+    if matching.next().is_some() {
         return Err(Response::error(400, format_args!("the header {name} is given twice")));
     }
     let Some(first) = first else { return Ok(None) };

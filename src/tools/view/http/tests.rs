@@ -1,3 +1,5 @@
+//! Tests of the HTTP server over real connections, and of its parser.
+
 use std::io::{Read, Write};
 use std::net::{TcpListener, TcpStream};
 use std::sync::atomic::{AtomicBool, Ordering};

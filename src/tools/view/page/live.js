@@ -1,7 +1,7 @@
 // The page of a run in training: its progress, curves and edits, and commands to it.
 "use strict";
 
-/** Interval between requests of the progress [ms]. */
+/** Interval between requests for the progress [ms]. */
 const ASK_EVERY = 1000;
 /** Minimum time between two pictures of the changing model [ms]. */
 const PICTURE_EVERY = 2000;
@@ -10,19 +10,19 @@ const PICTURE_EVERY = 2000;
 function followTraining(requestPicture) {
   const section = byId("training");
   section.hidden = false;
-  let before = null, requestedAt = 0, requestedStep = -1;
+  let previous = null, requestedAt = 0, requestedStep = -1;
   const number = (value) => value.toLocaleString("en");
 
-  const order = async (what) => {
+  const order = async (command) => {
     const answer = await fetch("order", {
       method: "POST",
       headers: { "Content-Type": "application/json" },
-      body: JSON.stringify({ order: what }),
+      body: JSON.stringify({ order: command }),
     });
     if (!answer.ok) byId("training-trouble").textContent = await answer.text();
     await ask();
   };
-  byId("pause").addEventListener("click", () => order(before?.state === "paused" ? "continue" : "pause"));
+  byId("pause").addEventListener("click", () => order(previous?.state === "paused" ? "continue" : "pause"));
   byId("one-step").addEventListener("click", () => order("step"));
   byId("checkpoint").addEventListener("click", () => order("checkpoint"));
   byId("stop").addEventListener("click", () => {
@@ -47,7 +47,7 @@ function followTraining(requestPicture) {
       [requestedAt, requestedStep] = [performance.now(), now.step];
       requestPicture();
     }
-    before = now;
+    previous = now;
     return true;
   }
 
@@ -107,8 +107,8 @@ function followTraining(requestPicture) {
     figure.querySelector(".ends").textContent = `${format(least)} to ${format(most)}`;
   }
 
-  const again = async () => {
-    if (await ask()) setTimeout(again, document.hidden ? 5 * ASK_EVERY : ASK_EVERY);
+  const poll = async () => {
+    if (await ask()) setTimeout(poll, document.hidden ? 5 * ASK_EVERY : ASK_EVERY);
   };
-  again();
+  poll();
 }

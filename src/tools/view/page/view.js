@@ -121,7 +121,7 @@ function dolly(factor) {
 
 /** Identifier of this page: the server keeps only the newest request of each page and pane. */
 const page = Array.from(crypto.getRandomValues(new Uint8Array(12)), (x) => x.toString(16).padStart(2, "0")).join("");
-/** Time from the last change to the request of the sharp picture [ms]. */
+/** Time from the last change to the request for the sharp picture [ms]. */
 const REST = 30;
 /** Target time between pictures while moving [ms]. */
 const PACE = 45;
@@ -130,11 +130,11 @@ const shown = [null, null];
 let coarse = 0.5, complete = -1, border = 0.5, wakeUp = () => {}, paces = [];
 /** Latency of a reply that needs no rendering, and time per byte of a reply [ms]. */
 let latency = 0, perByte = 0;
-/** Number of pending requests, number of all requests, and the one that is shown. */
+/** Number of pending requests, number of all requests so far, and the number of the request whose picture is shown. */
 let underway = 0, requests = 0, newest = 0;
 /** The last request, and the minimum time from it to the next one [ms]. */
 let last = { version: -1, isMoving: true, begun: 0 }, spacing = 0;
-/** When a picture was shown last. */
+/** Time at which the last picture was shown [ms]. */
 let shownAt = 0;
 
 const wake = () => wakeUp();

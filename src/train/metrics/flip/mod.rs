@@ -17,13 +17,13 @@ const PIXELS_PER_DEGREE: f64 = 3840.0 * PI / 180.0;
 /// degrees. Table 1.
 const SENSITIVITY: [[(f64, f64); 2]; 3] =
     [[(1.0, 0.0047), (0.0, 1e-5)], [(1.0, 0.0053), (0.0, 1e-5)], [(34.1, 0.04), (13.5, 0.025)]];
-/// Widest term of [`SENSITIVITY`], which determines the radius of all kernels.
+/// The b of the widest term of [`SENSITIVITY`], which determines the radius of all kernels.
 const WIDEST: f64 = 0.04;
 /// Exponent of colour distances, q_c.
 const COLOUR_EXPONENT: f64 = 0.7;
-/// Distances up to this fraction of the largest distance are small, p_c.
+/// Distances below this fraction of the largest distance count as small, p_c.
 const SMALL_SHARE: f64 = 0.4;
-/// Fraction of the range of errors that small distances fill, p_t.
+/// Fraction of the error range `[0, 1]` to which the small distances are mapped, p_t.
 const SMALL_RANGE: f64 = 0.95;
 /// Width of a feature `[degrees]`, w.
 const FEATURE_WIDTH: f64 = 0.082;
@@ -97,8 +97,8 @@ fn differences<T: Send>(
     })
 }
 
-/// Peak memory for a block of this width `[bytes]`: in `f64`, eight planes of the rows within the kernels' radius and
-/// seven of the block's own rows, and the [responses](PixelResponse) to two images.
+/// Peak memory for a block of this width `[bytes]`: eight `f64` planes that include the rows within the kernels'
+/// radius, seven of the block's own rows, and the [responses](PixelResponse) to both images.
 pub(super) fn bytes_per_block(width: u64) -> u64 {
     let (rows, lines) = (BLOCK as u64, (BLOCK + 2 * Filters::new().radius()) as u64);
     let float = size_of::<f64>() as u64;
@@ -139,7 +139,7 @@ fn largest_distance() -> f64 {
     hyab(green, blue).powf(COLOUR_EXPONENT)
 }
 
-/// Equation 6.
+/// Equation 6: the HyAB distance between two colours.
 fn hyab(a: [f64; 3], b: [f64; 3]) -> f64 {
     (a[0] - b[0]).abs() + (a[1] - b[1]).hypot(a[2] - b[2])
 }
@@ -181,9 +181,9 @@ fn linear(encoded: f64) -> f64 {
     if encoded <= 0.040_45 { encoded / 12.92 } else { ((encoded + 0.055) / 1.055).powf(2.4) }
 }
 
-/// The kernels of both pipelines along one axis. Every filter is a sum of separable ones.
+/// The one-dimensional kernels of both pipelines. Every filter is a sum of separable filters.
 struct Filters {
-    /// One kernel per term of each opponent channel. Applied along both axes, it has the weight of the term.
+    /// One kernel per term of each opponent channel; applied along both axes, it has the weight of the term.
     sensitivity: [Vec<Vec<f64>>; 3],
     /// A Gaussian as wide as features, with sum 1, and its first and second derivatives, whose positive taps sum to 1
     /// and negative taps to −1.

@@ -24,7 +24,7 @@ fn between(render: &Image8, truth: &Image8) -> f64 {
     flip(&as_render(render), truth, [0.0; 3]).unwrap()
 }
 
-/// Means by the authors' own program, version 1.7, at its default viewing distance.
+/// The expected means were computed by the authors' program, version 1.7, at its default viewing distance.
 #[test]
 fn values_agree_with_the_authors_program() {
     let black = target(9, 9, |_, _, _| 0.0);
@@ -44,8 +44,8 @@ fn values_agree_with_the_authors_program() {
 fn equal_images_do_not_differ_and_order_does_not_matter() {
     // Not exactly 0: the render is rounded to f32, and FLIP amplifies small distances.
     assert!(between(&waves(0.0), &waves(0.0)) < 1e-4);
-    let (there, back) = (between(&waves(0.3), &waves(0.0)), between(&waves(0.0), &waves(0.3)));
-    assert!((there - back).abs() < 1e-5, "{there} and {back}");
+    let (forward, reverse) = (between(&waves(0.3), &waves(0.0)), between(&waves(0.0), &waves(0.3)));
+    assert!((forward - reverse).abs() < 1e-5, "{forward} and {reverse}");
 }
 
 #[test]

@@ -19,15 +19,15 @@ pub use measure::measure;
 pub struct Geometry {
     /// Depth errors in the measured views.
     pub depth: DepthErrors,
-    /// Median angle between the surface's normal and the shortest axis of the Gaussian at a pixel
-    /// `[degrees]`, in 0..=90. The Gaussian is the densest at the surface point among the eight of
-    /// opacity above 0.1 with the nearest centres; it approximates the one with the largest blend
-    /// weight. Measured at up to 2,000 pixels per view, evenly spaced among those of [`DepthErrors`].
+    /// Median angle between the surface's normal and the shortest axis of the Gaussian at a pixel `[degrees]`, in
+    /// 0..=90. Of the eight Gaussians of opacity above 0.1 with the nearest centres, the densest at the surface point
+    /// is used, which approximates the Gaussian with the largest blend weight. Measured at up to 2,000 pixels per view,
+    /// evenly spaced among those of [`DepthErrors`].
     #[serde(deserialize_with = "or_nan")]
     pub normal_error: f64,
-    /// Distances between centres and surface.
+    /// Distances between the centres of Gaussians and the surface.
     pub centres: CentreErrors,
-    /// Rows in empty space.
+    /// Opaque rows in empty space.
     pub floaters: Floaters,
     /// Recall of thin structures by width, thinnest first; empty if the scene has none.
     pub thin: Vec<ThinRecall>,
@@ -35,8 +35,8 @@ pub struct Geometry {
     pub redundancy: Redundancy,
 }
 
-/// Errors of the rendered depth Σ α·T·z / Σ α·T against that of the first surface, over the pixels that show a surface
-/// and have a rendered alpha above 0.5.
+/// Errors of the rendered depth Σ α·T·z / Σ α·T against the depth of the visible surface, over the pixels that show a
+/// surface and have a rendered alpha above 0.5.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct DepthErrors {
     /// Root mean square error `[diagonals]`.
@@ -50,7 +50,7 @@ pub struct DepthErrors {
     pub coverage: f64,
 }
 
-/// Distances between centres and surface. The centres of large Gaussians may legitimately be off the surface.
+/// Distances between the centres of Gaussians and the surface; those of large Gaussians may legitimately be off it.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct CentreErrors {
     /// Mean distance from centre to mesh, weighted by w `[diagonals]`.
@@ -70,7 +70,7 @@ pub struct CentreErrors {
     /// recall (fraction of the samples within that distance from a centre).
     #[serde(deserialize_with = "or_nan")]
     pub f_score_half_percent: f64,
-    /// The same with 1 % of the diagonal.
+    /// The same harmonic mean, with 1 % of the diagonal instead of 0.5 %.
     #[serde(deserialize_with = "or_nan")]
     pub f_score_one_percent: f64,
 }
@@ -81,10 +81,10 @@ pub struct CentreErrors {
 pub struct Floaters {
     /// Number of floaters.
     pub count: usize,
-    /// Fraction of the rows.
+    /// Number of floaters as a fraction of all rows.
     #[serde(deserialize_with = "or_nan")]
     pub of_rows: f64,
-    /// Fraction of the weight w.
+    /// Weight w of the floaters as a fraction of that of all rows.
     #[serde(deserialize_with = "or_nan")]
     pub of_weight: f64,
 }
@@ -127,15 +127,15 @@ pub struct KnownScene<'a> {
     pub is_stopped: &'a dyn Fn() -> bool,
 }
 
-/// The values that the backend for [`measure`] must record; pass them when creating it.
+/// The values that the backend for [`measure`] must record; pass them when creating the backend.
 pub fn needs() -> Needs {
     let columns = vec![AuxColumn::WeightSum, AuxColumn::WeightMax, AuxColumn::PixelCount];
     Needs { aux: Some(AuxRequest { columns, ..AuxRequest::default() }), ..Needs::default() }
 }
 
-/// Peak memory for [`measure`] in addition to the backend and the surface `[bytes]`: per row, two copies of the model
-/// (while it is read or downloaded), position, axes, sums and two search trees; per pixel, the renders, and the
-/// surface's depth and normals and their files; samples and angles.
+/// Peak memory for [`measure`] in addition to the backend and the surface `[bytes]`. Per row: two copies of the model
+/// (while it is read or downloaded), position, axes, sums and two search trees. Per pixel: the renders, the surface's
+/// depth and normals, and the files of both. In addition: samples and angles.
 pub fn bytes(rows: usize, sh_degree: u8, image: (u32, u32), views: usize) -> u64 {
     let row = 2 * 4 * (11 + 3 * densify_core::gaussians::sh_coefficients(sh_degree) as u64) + 512;
     let pixels = u64::from(image.0) * u64::from(image.1);

@@ -55,7 +55,7 @@ impl Convolution {
         (side + 2 * self.padding).checked_sub(self.side).map_or(0, |rest| rest / self.stride + 1)
     }
 
-    /// The rows of an image of this height on which some rows of the result depend.
+    /// The rows of an image of this height on which `rows` of the result depend.
     pub(super) fn input_rows(&self, rows: &Range<usize>, height: usize) -> Range<usize> {
         let first = (rows.start * self.stride).saturating_sub(self.padding);
         let end =
@@ -63,7 +63,7 @@ impl Convolution {
         first..end.min(height)
     }
 
-    /// Computes some rows of the result. `image` must contain the rows on which they depend, except those outside the
+    /// Computes `rows` of the result. `image` must contain the rows on which they depend, except those outside the
     /// whole image, which count as 0.
     pub(super) fn run(&self, image: &Activation, rows: Range<usize>) -> Activation {
         let width = self.output_side(image.width);
@@ -96,7 +96,7 @@ impl Convolution {
         result
     }
 
-    /// Gathers the kernel's inputs for some pixels (row, column) of the result, with 0 outside the image. Shape:
+    /// Gathers the kernel's inputs for up to 16 pixels (row, column) of the result, with 0 outside the image. Shape:
     /// `[input channels · side · side, 16]`.
     fn gather(
         &self,
@@ -127,7 +127,7 @@ impl Convolution {
         inputs
     }
 
-    /// Sums of all outputs for pixels that are processed together.
+    /// The products of all weights with the gathered inputs of up to 16 pixels. Shape: `[outputs padded to 6, 16]`.
     #[inline(always)]
     fn multiply(&self, inputs: &[[f32; PIXELS]]) -> Vec<[f32; PIXELS]> {
         let mut result = Vec::with_capacity(self.weights.len() / inputs.len().max(1) * OUTPUTS);

@@ -1,4 +1,4 @@
-//! LPIPS, a distance between images by the features of a trained network (Zhang, Isola, Efros, Shechtman, Wang,
+//! LPIPS, a distance between the features of two images in a trained network (Zhang, Isola, Efros, Shechtman, Wang,
 //! *The Unreasonable Effectiveness of Deep Features as a Perceptual Metric*, CVPR 2018, arXiv 1801.03924,
 //! version 0.1).
 //!
@@ -41,8 +41,8 @@ impl Lpips {
     /// LPIPS of a render against a target, >= 0; 0 for equal images.
     ///
     /// `rendered`: shape `[height, width, 3]`, clamped to `[0, 1]` here. Targets with coverage are composited on
-    /// `background`, in `[0, 1]`. A mask scales the differences of pixels at the input of the network. NaN if the
-    /// render contains a NaN.
+    /// `background`, in `[0, 1]`. A mask scales the differences between the pixels of both images before the first
+    /// stage. NaN if the render contains a NaN.
     ///
     /// # Errors
     /// When the sizes differ, the image is too small for the network, or the target's mask ignores every pixel.
@@ -72,7 +72,7 @@ impl Lpips {
     }
 }
 
-/// Render and target as inputs of the networks.
+/// Render and target as inputs of the network.
 fn images(pair: &Pair<'_>) -> [Activation; 2] {
     let (width, height) = (pair.width, pair.height);
     let scaled = |c: usize, value: f64| (2.0 * value as f32 - 1.0 - SHIFT[c]) / SCALE[c];

@@ -1,4 +1,4 @@
-//! The tables of both networks, and their stages: convolutions, distances of features, pooling.
+//! The layers of both networks, and their stages: convolutions, feature distances, pooling.
 
 use std::ops::Range;
 
@@ -8,7 +8,7 @@ use super::EPSILON;
 use super::convolution::Convolution;
 use crate::metrics::THREADS;
 
-/// Number of rows of features in memory at a time, because a whole stage with many channels would be too large.
+/// Number of feature rows in memory at a time, because a whole stage with many channels would be too large.
 const STRIP: usize = 64;
 
 /// A network whose features are compared.
@@ -110,7 +110,7 @@ pub(super) struct Stage {
 }
 
 impl Stage {
-    /// The distance of two images by this stage's features, and the inputs of the next stage.
+    /// The distance between the features of two images in this stage, and the inputs of the next stage.
     pub(super) fn run(&self, images: &[Activation; 2]) -> (f64, [Activation; 2]) {
         let [mut height, mut width] = [images[0].rows.end, images[0].width];
         for convolution in &self.convolutions {
@@ -135,7 +135,7 @@ impl Stage {
         (sum / (width * height) as f64, next)
     }
 
-    /// Computes some rows of the features of an image.
+    /// Computes `rows` of the features of an image.
     fn features(&self, image: &Activation, rows: Range<usize>) -> Activation {
         let mut heights = vec![image.rows.end];
         for convolution in &self.convolutions {
@@ -154,7 +154,7 @@ impl Stage {
         features.expect("every stage has a convolution")
     }
 
-    /// The sum of weighted squared differences of unit-length features over some rows.
+    /// The sum of weighted squared differences of unit-length features over `rows`.
     fn distance(&self, [a, b]: &[Activation; 2], rows: Range<usize>) -> f64 {
         let row = |row: usize| -> f64 {
             let mut sums = vec![[0.0_f32; 2]; a.width];
@@ -187,7 +187,7 @@ impl Stage {
         by_row.iter().sum()
     }
 
-    /// Pools some rows of the features into the input of the next stage.
+    /// Pools the features whose windows begin in `strip` into the input of the next stage.
     fn pool(&self, features: &Activation, strip: Range<usize>, next: &mut Activation) {
         let (width, height) = (next.width, next.rows.len());
         for channel in 0..features.channels {

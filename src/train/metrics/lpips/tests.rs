@@ -8,7 +8,7 @@ use safetensors::tensor::{Dtype, TensorView};
 use super::network::Network;
 use super::*;
 
-/// SplitMix64 of a counter, as numbers in `[0, 1)` with 24 bits.
+/// Random numbers in `[0, 1)` with 24 bits: SplitMix64 of a counter.
 fn unit(seed: u64, count: usize) -> impl Iterator<Item = f64> {
     (0..count as u64).map(move |i| {
         let x = (i + (seed << 32)).wrapping_add(0x9e37_79b9_7f4a_7c15);
@@ -65,7 +65,7 @@ fn pair(width: u32, height: u32) -> (Vec<f32>, Image8) {
 }
 
 #[test]
-fn values_agree_with_another_implementation() {
+fn values_agree_with_onnx_runtime() {
     // The largest images are processed in several strips of rows.
     let vgg = [
         (40, 37, 0.095_950_650_516_9),
@@ -82,8 +82,8 @@ fn values_agree_with_another_implementation() {
         assert_eq!(lpips.network(), network);
         for (width, height, expected) in sizes {
             let (render, target) = pair(width, height);
-            let found = lpips.compare(&render, &target, [0.0; 3]).unwrap();
-            assert!((found - expected).abs() < 1e-6, "{network:?} {width}x{height}: {found}");
+            let distance = lpips.compare(&render, &target, [0.0; 3]).unwrap();
+            assert!((distance - expected).abs() < 1e-6, "{network:?} {width}x{height}: {distance}");
         }
     }
 }
@@ -112,8 +112,8 @@ fn masked_pixels_do_not_count_and_equal_images_have_no_distance() {
     target.mask = None;
     target.alpha = Some(vec![0; 40 * 36]);
     let flat: Vec<f32> = [0.25, 0.5, 0.75].repeat(40 * 36);
-    let found = lpips.compare(&flat, &target, [0.25, 0.5, 0.75]).unwrap();
-    assert!(found < 1e-10, "{found}");
+    let distance = lpips.compare(&flat, &target, [0.25, 0.5, 0.75]).unwrap();
+    assert!(distance < 1e-10, "{distance}");
     let (render, small) = pair(30, 40);
     let refused = lpips.compare(&render, &small, [0.0; 3]).unwrap_err().to_string();
     assert!(refused.contains("30x40") && refused.contains("31"), "{refused}");

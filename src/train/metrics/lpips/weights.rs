@@ -1,4 +1,4 @@
-//! Reads the file of weights: a safetensors file with the arrays of the published package `lpips`.
+//! Reads the weights: a safetensors file with the arrays of the published package `lpips`.
 
 use std::io::Read;
 use std::path::{Path, PathBuf};
@@ -11,7 +11,7 @@ use super::convolution::Convolution;
 use super::network::{Layer, Network, Stage};
 use densify_core::files;
 
-/// Largest file of weights `[bytes]`; VGG-16 takes 59 MB.
+/// Size of the largest accepted file of weights `[bytes]`; VGG-16 takes 59 MB.
 const MAX_BYTES: u64 = 256 << 20;
 /// Remedy for unsuitable files.
 const REMEDY: &str = "create it as described in docs/metrics.md";
@@ -32,7 +32,7 @@ pub enum LpipsError {
     Malformed {
         /// The file.
         path: PathBuf,
-        /// The fault.
+        /// What is wrong with the file.
         problem: String,
     },
 }
@@ -79,7 +79,7 @@ impl Lpips {
     }
 }
 
-/// Reads a convolution.
+/// Reads a convolution of a stage.
 fn convolution(
     file: &SafeTensors<'_>,
     stage: usize,
@@ -92,14 +92,14 @@ fn convolution(
     Ok(Convolution::new(channels, (side, stride, padding), &weights, bias))
 }
 
-/// Reads an array.
+/// Reads an array of 32-bit floats, and checks its shape and that all values are finite.
 fn array(file: &SafeTensors<'_>, name: &str, shape: &[usize]) -> Result<Vec<f32>, String> {
-    let found = file.tensor(name).map_err(|_| format!("`{name}` is missing"))?;
-    if found.dtype() != Dtype::F32 || found.shape() != shape {
-        let (kind, found) = (found.dtype(), found.shape());
-        return Err(format!("`{name}` is {kind:?} {found:?} instead of F32 {shape:?}"));
+    let tensor = file.tensor(name).map_err(|_| format!("`{name}` is missing"))?;
+    if tensor.dtype() != Dtype::F32 || tensor.shape() != shape {
+        let (kind, actual) = (tensor.dtype(), tensor.shape());
+        return Err(format!("`{name}` is {kind:?} {actual:?} instead of F32 {shape:?}"));
     }
-    let values = found.data().as_chunks::<4>().0.iter().map(|bytes| f32::from_le_bytes(*bytes));
+    let values = tensor.data().as_chunks::<4>().0.iter().map(|bytes| f32::from_le_bytes(*bytes));
     let values: Vec<f32> = values.collect();
     if values.iter().any(|value| !value.is_finite()) {
         return Err(format!("`{name}` has non-finite values"));

@@ -165,9 +165,9 @@ impl RunFolder {
         fs::create_dir_all(target).map_err(fail)?;
         let lock = Rc::new(FolderLock::take(target)?);
         recover(target)?;
-        let is_worthless =
+        let is_empty =
             |path: &PathBuf| !path.join(CHECKPOINTS).exists() && saved_iterations(path).is_err();
-        remove_all(Self::staged(target).into_iter().filter(is_worthless));
+        remove_all(Self::staged(target).into_iter().filter(is_empty));
         Ok(Self { target: target.to_owned(), is_new, staged: None, lock })
     }
 
@@ -223,7 +223,7 @@ impl RunFolder {
         }
     }
 
-    /// Ends a failed run. An existing run stays, and the files of the failed one stay in the returned folder.
+    /// Ends a failed run, whose files stay in the returned folder. An existing run stays, too.
     pub fn abandon(self) -> PathBuf {
         self.path()
     }

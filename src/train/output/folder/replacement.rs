@@ -13,7 +13,8 @@ pub(super) const NEW: &str = ".densify-new-";
 /// Prefix of the hidden folder to which the old run is moved, with the same suffix. While it exists, the old run is the
 /// valid one.
 pub(super) const OLD: &str = ".densify-old-";
-/// Replaces the prefix [`OLD`] when all of the old run has been moved; from then on the new run is the valid one.
+/// The prefix to which [`OLD`] is renamed when all of the old run has been moved; from then on the new run is the valid
+/// one.
 pub(super) const REPLACED: &str = ".densify-replaced-";
 
 /// Reason why a run could not replace another.
@@ -75,7 +76,7 @@ pub(super) fn hidden(target: &Path, prefix: &str) -> Vec<PathBuf> {
     entries.filter(|path| suffix(path, prefix).is_some() && path.is_dir()).collect()
 }
 
-/// The rest of a folder's name after a prefix.
+/// The rest of a folder's name after a prefix; `None` if the name does not have the prefix.
 pub(super) fn suffix(path: &Path, prefix: &str) -> Option<String> {
     Some(path.file_name()?.to_str()?.strip_prefix(prefix)?.to_owned())
 }

@@ -9,7 +9,7 @@ fn write(path: &Path, text: &str) {
     fs::write(path, text).unwrap();
 }
 
-fn tree(folder: &Path) -> Vec<String> {
+fn entries(folder: &Path) -> Vec<String> {
     let mut names: Vec<String> = fs::read_dir(folder)
         .unwrap()
         .map(|e| e.unwrap().file_name().into_string().unwrap())
@@ -26,7 +26,7 @@ fn a_new_run_writes_in_place_beside_foreign_files() {
     assert_eq!(run.path(), root.path());
     write(&run.path().join("config.toml"), "a");
     assert_eq!(run.finish().unwrap(), root.path());
-    assert_eq!(tree(root.path()), ["config.toml", "notes.txt"]);
+    assert_eq!(entries(root.path()), ["config.toml", "notes.txt"]);
     let error = RunFolder::create(root.path(), false).unwrap_err();
     assert!(matches!(error, FolderError::Occupied { .. }), "{error}");
     assert!(error.to_string().contains("another run"), "{error}");
@@ -38,19 +38,19 @@ fn replacing_affects_only_files_of_runs_and_only_at_the_end() {
     for name in ["config.toml", "stats/old.jsonl", "events.out.tfevents.1", "notes.txt"] {
         write(&root.path().join(name), "old");
     }
-    let before = tree(root.path());
+    let before = entries(root.path());
     let run = RunFolder::create(root.path(), true).unwrap();
     write(&run.path().join("config.toml"), "new");
     write(&run.path().join("point_cloud/iteration_1/point_cloud.ply"), "new");
     assert_eq!(fs::read(root.path().join("config.toml")).unwrap(), b"old");
     run.discard();
-    assert_eq!(tree(root.path()), before, "a run that is discarded leaves nothing");
+    assert_eq!(entries(root.path()), before, "a run that is discarded leaves nothing");
 
     let run = RunFolder::create(root.path(), true).unwrap();
     write(&run.path().join("config.toml"), "new");
     write(&run.path().join("point_cloud/iteration_1/point_cloud.ply"), "new");
     run.finish().unwrap();
-    assert_eq!(tree(root.path()), ["config.toml", "notes.txt", "point_cloud"]);
+    assert_eq!(entries(root.path()), ["config.toml", "notes.txt", "point_cloud"]);
     assert_eq!(fs::read(root.path().join("config.toml")).unwrap(), b"new");
 }
 
@@ -62,7 +62,7 @@ fn a_failed_replacement_leaves_the_old_run_unchanged() {
         for name in ["config.toml", "cameras.json", "stats/old.jsonl"] {
             write(&root.path().join(name), "old");
         }
-        let before = tree(root.path());
+        let before = entries(root.path());
         let run = RunFolder::create(root.path(), true).unwrap();
         for name in ["config.toml", "cameras.json", "results.json"] {
             write(&run.path().join(name), "new");
@@ -76,9 +76,9 @@ fn a_failed_replacement_leaves_the_old_run_unchanged() {
         let staging = run.path().to_owned();
         let error = with_fault(Some(fault), || run.finish()).0.unwrap_err().to_string();
         assert!(error.contains(file) && error.contains(&*staging.to_string_lossy()), "{error}");
-        assert_eq!(tree(&staging), ["cameras.json", "config.toml", "results.json"]);
+        assert_eq!(entries(&staging), ["cameras.json", "config.toml", "results.json"]);
         fs::remove_dir_all(staging).unwrap();
-        assert_eq!(tree(root.path()), before);
+        assert_eq!(entries(root.path()), before);
         assert_eq!(fs::read(root.path().join("cameras.json")).unwrap(), b"old");
     }
 }
@@ -106,16 +106,16 @@ fn a_stuck_replacement_is_reported_and_recovered() {
         }
         let fault = Fault { operation, file, spared, kind: std::io::ErrorKind::Other };
         let error = with_fault(Some(fault), || run.finish()).0.unwrap_err().to_string();
-        let what = format!("{operation:?} {spared}: {error}");
-        let aside_folder = tree(root.path())
+        let case = format!("{operation:?} {spared}: {error}");
+        let aside_folder = entries(root.path())
             .into_iter()
             .find(|name| aside.is_some_and(|aside| name.starts_with(aside)));
-        assert_eq!(aside_folder.is_some(), aside.is_some(), "{what}");
-        assert_eq!(error.contains("is unchanged"), aside.is_none(), "{what}");
-        assert!(aside_folder.is_none_or(|name| error.contains(&name)), "{what}");
+        assert_eq!(aside_folder.is_some(), aside.is_some(), "{case}");
+        assert_eq!(error.contains("is unchanged"), aside.is_none(), "{case}");
+        assert!(aside_folder.is_none_or(|name| error.contains(&name)), "{case}");
         RunFolder::recover(root.path()).unwrap();
-        assert_eq!(fs::read_to_string(root.path().join("config.toml")).unwrap(), valid, "{what}");
-        assert_eq!(root.path().join("cameras.json").exists(), valid == "old", "{what}");
+        assert_eq!(fs::read_to_string(root.path().join("config.toml")).unwrap(), valid, "{case}");
+        assert_eq!(root.path().join("cameras.json").exists(), valid == "old", "{case}");
     }
 }
 
@@ -131,15 +131,15 @@ fn a_resumed_run_has_no_incomplete_files() {
     write(&root.path().join(".densify-new-x/checkpoints/a"), "another run, waiting");
     write(&root.path().join(".densify-new-y/config.toml"), "killed before it had anything");
     drop(RunFolder::resume(root.path(), false).unwrap());
-    assert_eq!(tree(root.path()), [".densify-new-x", "config.toml", "point_cloud", "stats"]);
-    assert_eq!(tree(&root.path().join("stats")), ["train.jsonl"]);
-    assert_eq!(tree(&root.path().join("point_cloud/iteration_1")), ["point_cloud.ply"]);
+    assert_eq!(entries(root.path()), [".densify-new-x", "config.toml", "point_cloud", "stats"]);
+    assert_eq!(entries(&root.path().join("stats")), ["train.jsonl"]);
+    assert_eq!(entries(&root.path().join("point_cloud/iteration_1")), ["point_cloud.ply"]);
     assert_eq!(RunFolder::staged(root.path()), [root.path().join(".densify-new-x")]);
     // A restart would remove a model.
     assert!(RunFolder::resume(root.path(), true).unwrap_err().to_string().contains("another run"));
     fs::remove_dir_all(root.path().join("point_cloud")).unwrap();
     drop(RunFolder::resume(root.path(), true).unwrap());
-    assert_eq!(tree(root.path()), [".densify-new-x", "config.toml"]);
+    assert_eq!(entries(root.path()), [".densify-new-x", "config.toml"]);
     // Without a configuration the files do not belong to a run.
     fs::rename(root.path().join("config.toml"), root.path().join("stats")).unwrap();
     assert!(RunFolder::resume(root.path(), true).unwrap_err().to_string().contains("another run"));
@@ -147,7 +147,7 @@ fn a_resumed_run_has_no_incomplete_files() {
     let run = RunFolder::create(root.path(), true).unwrap();
     write(&run.path().join("config.toml"), "new");
     run.finish().unwrap();
-    assert_eq!(tree(root.path()), ["config.toml"]);
+    assert_eq!(entries(root.path()), ["config.toml"]);
 }
 
 #[test]
@@ -176,7 +176,7 @@ fn an_interrupted_replacement_is_completed_or_undone_by_the_next_run() {
             None => (OLD_RUN, "old"),
             Some(_) => (NEW_RUN, "new"),
         };
-        assert_eq!(tree(root.path()), names, "{out} out, {moved_in:?} in");
+        assert_eq!(entries(root.path()), names, "{out} out, {moved_in:?} in");
         assert_eq!(fs::read_to_string(root.path().join("config.toml")).unwrap(), text);
     }
 }
@@ -244,10 +244,10 @@ fn a_discarded_run_leaves_other_files() {
     assert!(!target.exists());
     write(&target.join("notes.txt"), "mine");
     discard(false);
-    assert_eq!(tree(&target), ["notes.txt"]);
+    assert_eq!(entries(&target), ["notes.txt"]);
     write(&target.join("config.toml"), "old");
     discard(true);
-    assert_eq!(tree(&target), ["config.toml", "notes.txt"]);
+    assert_eq!(entries(&target), ["config.toml", "notes.txt"]);
     assert_eq!(fs::read(target.join("config.toml")).unwrap(), b"old");
 }
 
@@ -268,7 +268,7 @@ fn checking_writes_nothing() {
     let root = tempfile::tempdir().unwrap();
     let (absent, file) = (root.path().join("a/b"), root.path().join("file"));
     RunFolder::check(&absent, false).unwrap();
-    assert!(tree(root.path()).is_empty());
+    assert!(entries(root.path()).is_empty());
     write(&file, "x");
     let message = RunFolder::check(&file, true).unwrap_err().to_string();
     assert!(message.contains("not a folder"), "{message}");

@@ -45,17 +45,17 @@ impl<V: ViewSource> Trainer<V> {
         tracing::info!(step, rows, psnr, settled, gain, limit, "automatic budget");
         let mut event = None;
         if settled && removes {
-            let (least, change) = self.least_important(step, psnr)?;
-            let after = rows - least.len();
+            let (unimportant, change) = self.unimportant_rows(step, psnr)?;
+            let after = rows - unimportant.len();
             tracing::info!(step, before = rows, after, change, "removal of unimportant rows");
             auto.removals.push(Removal { step, before: rows, after, change });
             auto.stopped.get_or_insert(step);
             // The policy may not replace the removed rows.
             auto.limit = after;
-            if !least.is_empty() {
+            if !unimportant.is_empty() {
                 let mut plan = self.new_plan();
                 plan.cause("auto budget");
-                plan.prune_all(least);
+                plan.prune_all(unimportant);
                 event = self.execute(step, plan)?;
             }
         }
@@ -65,7 +65,7 @@ impl<V: ViewSource> Trainer<V> {
 
     /// The rows to remove, and the change of the probe views' PSNR without them, relative to `psnr` with all rows
     /// `[dB]`; if no row can be removed, the change without a tenth of the rows.
-    fn least_important(&mut self, step: u32, psnr: f64) -> Result<(Vec<u32>, f64), TrainError> {
+    fn unimportant_rows(&mut self, step: u32, psnr: f64) -> Result<(Vec<u32>, f64), TrainError> {
         let signals = self.backend.take_signals(growth_signals()).at(step)?;
         let weights = signals.get(Signal::WeightMax).unwrap_or_default();
         let mut rows: Vec<u32> = (0..weights.len() as u32).collect();
@@ -95,10 +95,10 @@ impl<V: ViewSource> Trainer<V> {
                 logits[row as usize] = HIDDEN_LOGIT;
             }
             self.set_opacity_logits(step, &logits)?;
-            let without = mean(&self.probe_psnr(step, degree)?) - psnr;
-            let is_too_much = -without >= allowed_loss(tenth);
+            let difference = mean(&self.probe_psnr(step, degree)?) - psnr;
+            let is_too_much = -difference >= allowed_loss(tenth);
             if !is_too_much || count == 0 {
-                change = without;
+                change = difference;
             }
             if is_too_much {
                 break;

@@ -35,9 +35,10 @@ pub const MIN_GAIN: f64 = 0.10;
 /// views are always the same; with random views the noise would be larger than this.
 const MAX_DROP: f64 = 0.5;
 /// Number of intervals after which a loss counts as permanent. The insertions of `diet` take a sixth of a run, which is
-/// four intervals.
+/// less than four intervals.
 const RECENT: usize = 6;
-/// Steps of an interval in a run of 30,000. Most policies then stop growing after ten intervals, or five doublings.
+/// Number of steps per interval in a run of 30,000 steps. Most policies stop growing halfway through the run: after ten
+/// intervals, or five doublings.
 const INTERVAL: u32 = 1_500;
 /// Intervals are multiples of this number of steps, because policies are due at most every 100 steps.
 const INTERVAL_UNIT: u32 = 100;
@@ -45,9 +46,9 @@ const INTERVAL_UNIT: u32 = 100;
 const GROWTH_FACTOR: f64 = std::f64::consts::SQRT_2;
 /// Smallest initial limit.
 const MIN_LIMIT: usize = 1_000;
-/// Number of intervals to which the slope is fitted.
+/// Number of settled intervals to which the slope is fitted.
 const FITTED: usize = 3;
-/// Share of the run after which no rows are removed, so that the remaining ones can adapt.
+/// Fraction of the run after which no rows are removed, so that the remaining rows can adapt.
 const LAST_REMOVAL: f64 = 0.8;
 /// Largest number of tenths of the rows that are removed at once.
 const MAX_TENTHS: usize = 5;
@@ -87,8 +88,8 @@ pub struct Interval {
     pub psnr: f64,
     /// True if the PSNR is near its recent best; otherwise the interval is not evaluated.
     pub settled: bool,
-    /// Gain over this settled interval and the two before it, including the effect of training `[dB per doubling]`;
-    /// `None` if there are fewer, if rows did not increase, or after growth.
+    /// Gain over the last three settled intervals including this one, with the effect of training `[dB per doubling]`.
+    /// `None` if there are fewer than three, if their numbers of rows are too similar, or after growth.
     pub gain: Option<f64>,
 }
 
@@ -146,7 +147,7 @@ impl AutoBudget {
     }
 }
 
-/// The slope of PSNR over log2(rows) `[dB per doubling]`, by least squares.
+/// The slope of PSNR over log2(rows) `[dB per doubling]`, by least squares; `None` if it cannot be fitted.
 fn slope(intervals: &[Interval]) -> Option<f64> {
     let count = intervals.len() as f64;
     let doublings = |interval: &Interval| (interval.rows.max(1) as f64).log2();
@@ -154,7 +155,7 @@ fn slope(intervals: &[Interval]) -> Option<f64> {
     let y = intervals.iter().map(|interval| interval.psnr).sum::<f64>() / count;
     let variance: f64 = intervals.iter().map(|i| (doublings(i) - x).powi(2)).sum();
     let covariance: f64 = intervals.iter().map(|i| (doublings(i) - x) * (i.psnr - y)).sum();
-    // The spread must exceed that of three equally spaced points that span a quarter of a doubling.
+    // The variance must exceed that of three equally spaced points that span a quarter of a doubling.
     let is_enough = intervals.len() == FITTED && variance > 2.0 * 0.125_f64.powi(2);
     is_enough.then(|| covariance / variance)
 }

@@ -11,9 +11,9 @@ const ONE_IN: usize = 20;
 const MIN_PROBES: usize = 4;
 /// Largest number of probe views.
 const MAX_PROBES: usize = 16;
-/// Smallest number of training views from which probe views are chosen.
+/// Smallest number of training views for which probe views are chosen.
 const MIN_VIEWS: usize = 2 * MIN_PROBES;
-/// Upper bound of a measured PSNR, which would be infinite for equal images `[dB]`.
+/// Upper bound to which a measured PSNR is clamped, because equal images have an infinite PSNR `[dB]`.
 const MAX_PSNR: f64 = 99.0;
 
 /// The probe views in ascending order, chosen by the seed; empty if there are too few views.
@@ -21,7 +21,7 @@ pub(in crate::trainer) fn probe_views(views: usize, seed: u64) -> Vec<usize> {
     if views < MIN_VIEWS {
         return Vec::new();
     }
-    // The sample of step 0 is not one of a policy's, as policies sample views only at later steps.
+    // No policy gets the sample of step 0, because policies sample views only at later steps.
     let mut chosen =
         schedule::fresh_views(views, views.div_ceil(ONE_IN).clamp(MIN_PROBES, MAX_PROBES), seed, 0);
     chosen.sort_unstable();

@@ -15,12 +15,12 @@ fn edits_are_reported_and_the_budget_holds() {
 }
 
 #[test]
-fn frozen_rows_count_for_the_budget_and_are_hidden_from_policies() {
+fn frozen_rows_count_towards_the_budget_and_are_hidden_from_policies() {
     let case = Case { rows: 5, aux_views: 1, ..CASE };
     let info = SceneInfo { budget: 7, initial_rows: 2, ..scene(&case, 3) };
     let options = TrainOptions { frozen: 3, ..OPTIONS };
     let refused = build(&case, 3, scene(&case, 3), options);
-    assert!(matches!(refused, Err(TrainError::BadOption(why)) if why.contains("3 frozen")));
+    assert!(matches!(refused, Err(TrainError::BadOption(why)) if why.contains("(3 frozen)")));
     let (mut trainer, log, _) = build(&case, 3, info, options).unwrap();
     let events: Vec<EditEvent> = (0..9).flat_map(|_| trainer.step().unwrap().events).collect();
     let counts: Vec<_> =
@@ -31,7 +31,7 @@ fn frozen_rows_count_for_the_budget_and_are_hidden_from_policies() {
     let case = Case { unsound: 1, behaviour: Behaviour::Nothing, ..case };
     let info = SceneInfo { budget: 7, initial_rows: 2, ..scene(&case, 3) };
     let (mut trainer, ..) = build(&case, 3, info, options).unwrap();
-    let error = (0..9).find_map(|_| trainer.step().err()).expect("it ends");
+    let error = (0..9).find_map(|_| trainer.step().err()).expect("the run ends");
     assert!(matches!(error, TrainError::NonFinite { .. }), "{error}");
 }
 
@@ -40,7 +40,7 @@ fn a_plan_that_changes_nothing_is_not_an_event() {
     let (mut trainer, log, _) = trainer(&Case { behaviour: Behaviour::Nothing, ..CASE });
     assert!((0..9).all(|_| trainer.step().unwrap().events.is_empty()));
     assert!(trainer.state.events.is_empty());
-    // Plans may reset statistics and are therefore executed in any case.
+    // Such a plan is executed nevertheless, because it may reset statistics.
     assert!(log.lock().unwrap().contains(&"apply 2".to_owned()));
 }
 

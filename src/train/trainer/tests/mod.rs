@@ -159,9 +159,9 @@ struct ScriptedPolicy {
     every: u32,
     aux_views: u32,
     cadence: Cadence,
-    /// Terms from step 7 on.
+    /// Loss terms and noise from step 7 on.
     terms: (LossTerms, Option<NoiseTerm>),
-    /// Resolution up to step 2.
+    /// Scale of the images up to step 2.
     resolution: f64,
     seen: Vec<f32>,
     behaviour: Behaviour,
@@ -216,14 +216,14 @@ impl DensityPolicy for ScriptedPolicy {
     }
     fn plan(
         &mut self,
-        now: &Snapshot<'_>,
+        snapshot: &Snapshot<'_>,
         _rng: &PolicyRng,
         plan: &mut EditPlan,
     ) -> Result<(), PolicyError> {
         if !self.seen.is_empty() {
             plan.cause(&format!("saw {:?}", std::mem::take(&mut self.seen)));
         }
-        let rows = now.signal(Signal::Opacity)?.len() as u32;
+        let rows = snapshot.signal(Signal::Opacity)?.len() as u32;
         plan.cause("scripted");
         match self.behaviour {
             Behaviour::Split => {
@@ -241,14 +241,14 @@ impl DensityPolicy for ScriptedPolicy {
             Behaviour::Panic => panic!("no row {rows}"),
             Behaviour::Fail => return Err(PolicyError::Other("out of ideas".into())),
             Behaviour::ReadUndeclared => {
-                now.signal(Signal::Age)?;
+                snapshot.signal(Signal::Age)?;
             }
         }
         Ok(())
     }
 }
 
-/// Sides of the views.
+/// Width and height of the views `[px]`.
 const SIDE: u32 = 64;
 
 struct FakeViews {

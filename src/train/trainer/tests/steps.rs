@@ -18,8 +18,8 @@ fn every_epoch_shows_every_view_once_and_prefetches() {
         shown.iter().enumerate().map(|(i, view)| format!("step {} view {view}", i + 1)).collect();
     assert_eq!(log.iter().filter(|d| *d != "epoch").cloned().collect::<Vec<_>>(), steps);
     // The next two views are prefetched, but none beyond the end of the run.
-    for (i, said) in prefetched.lock().unwrap().iter().enumerate() {
-        assert_eq!(*said, format!("{:?}", &shown[i + 1..(i + 3).min(9)]));
+    for (i, views) in prefetched.lock().unwrap().iter().enumerate() {
+        assert_eq!(*views, format!("{:?}", &shown[i + 1..(i + 3).min(9)]));
     }
 }
 
@@ -27,10 +27,10 @@ fn every_epoch_shows_every_view_once_and_prefetches() {
 #[test]
 fn exposures_belong_to_views() {
     let gains = [[1.0, 0.5, 1.0], [1.0; 3], [1.0, 1.5, 1.0]];
-    let first = |_| Exposures::new(ExposureModel::Channels, &gains);
+    let initial = || Exposures::new(ExposureModel::Channels, &gains);
     let case = Case { every: 100, ..CASE };
     let (new, log, _) = trainer(&case);
-    let mut new = new.with_exposures(Some(first(())));
+    let mut new = new.with_exposures(Some(initial()));
     let shown: Vec<usize> = (0..6).map(|_| new.step().unwrap().view).collect();
     let log = log.lock().unwrap().clone();
     let noted: Vec<f32> = log
@@ -45,10 +45,10 @@ fn exposures_belong_to_views() {
     assert!(noted[1..3].iter().zip(&shown[1..]).all(|(gain, view)| *gain > gains[*view][1]));
     let state = new.state().unwrap();
     assert_eq!(state.exposures, new.progress().exposures);
-    let (same, ..) = trainer(&case);
-    let mut same = same.with_exposures(Some(first(())));
-    same.resume(state.clone()).unwrap();
-    assert_eq!(same.progress().exposures, new.progress().exposures);
+    let (resumed, ..) = trainer(&case);
+    let mut resumed = resumed.with_exposures(Some(initial()));
+    resumed.resume(state.clone()).unwrap();
+    assert_eq!(resumed.progress().exposures, new.progress().exposures);
     let (mut without, ..) = trainer(&case);
     let refused = without.resume(state).unwrap_err().to_string();
     assert!(refused.contains("exposures"), "{refused}");
@@ -66,8 +66,8 @@ fn terms_and_noise_change_with_the_step() {
         let log = log.lock().unwrap().clone();
         Ok(log.into_iter().filter(|d| d.starts_with("terms")).collect::<Vec<_>>())
     };
-    let found: Result<_, TrainError> = noted(0.25, 2.0);
-    assert_eq!(found.unwrap(), ["terms (0.25, Some(2.0))"; 2]);
+    let terms: Result<_, TrainError> = noted(0.25, 2.0);
+    assert_eq!(terms.unwrap(), ["terms (0.25, Some(2.0))"; 2]);
     for (opacity, strength, part) in [(f32::NAN, 2.0, "opacity"), (0.5, -1.0, "noise.strength")] {
         let error = noted(opacity, strength).unwrap_err().to_string();
         assert!(error.starts_with("step 7: policy `scripted`: "), "{error}");
@@ -109,8 +109,8 @@ fn views_are_shrunk_with_their_cameras() {
     };
     assert_eq!(noted(0.5).unwrap(), ["size 32x32, cx 16, fy 0.5"; 2]);
     assert_eq!(noted(1.0).unwrap(), [""; 0]);
-    for share in [0.2, 1.5, f64::NAN] {
-        let error = noted(share).unwrap_err().to_string();
+    for scale in [0.2, 1.5, f64::NAN] {
+        let error = noted(scale).unwrap_err().to_string();
         assert!(error.starts_with("step 1: policy `scripted`: the resolution is"), "{error}");
     }
 }
@@ -130,7 +130,7 @@ fn errors_name_the_view() {
 }
 
 #[test]
-fn options_that_disagree_are_refused() {
+fn contradictory_options_are_refused() {
     let refused = |views, change: fn(&mut SceneInfo, &mut TrainOptions)| {
         let (mut scene, mut options) = (scene(&CASE, 3), OPTIONS);
         change(&mut scene, &mut options);
@@ -140,7 +140,7 @@ fn options_that_disagree_are_refused() {
     assert!(refused(2, |_, _| ()).contains("2 views"));
     assert!(refused(3, |_, o| o.iterations = 8).contains("8 iterations"));
     assert!(refused(3, |s, _| s.extent = f32::NAN).contains("extent"));
-    assert!(refused(3, |s, _| s.budget = 11).contains("budget 10 (scene: 11)"));
+    assert!(refused(3, |s, _| s.budget = 11).contains("budget 10 (scene's: 11)"));
     assert!(refused(3, |_, o| o.rates.quat = -1.0).contains("quat must"));
     assert!(build(&CASE, 3, scene(&CASE, 3), OPTIONS).is_ok());
 }

@@ -21,22 +21,22 @@ use densify_core::image::Image8;
 use scene_cache::Entry;
 pub use scene_cache::cache_folder;
 
-/// Upper bound on the memory while the search tree of a surface is built, as a multiple of the finished surface or of
-/// its file: a triangle takes 86 bytes in the file, up to 200 while the tree is built, and 100 afterwards.
+/// Upper bound on the memory for building a surface's search tree, as a multiple of the size of the surface or its
+/// file: a triangle takes 86 bytes in the file, up to 200 while the tree is built, and 100 afterwards.
 const BUILD_FACTOR: u64 = 4;
 
 /// A rendered built-in scene.
 #[derive(Debug, PartialEq)]
 struct Rendered {
-    about: About,
+    summary: Summary,
     /// The images of all views, in order.
     frames: Vec<Frame>,
     points: InitPoints,
 }
 
-/// Metadata of a scene, available without building it.
+/// Views and notes of a scene, which the cache holds in addition to images and points.
 #[derive(Debug, PartialEq, Serialize, Deserialize)]
-struct About {
+struct Summary {
     views: Vec<RenderedView>,
     notes: Vec<String>,
     /// As [`Dataset::surface_bytes`].
@@ -57,23 +57,23 @@ pub(in crate::dataset) fn load(
     let preset: PresetSpec = name.parse()?;
     let entry = options.cache.as_deref();
     let entry = entry.and_then(|folder| Entry::new(folder, &preset.to_string(), &parameters));
-    let kept = entry.as_ref().and_then(Entry::read);
-    // Another program may have written an entry with another number of images.
-    if let Some(kept) = kept.filter(|kept| kept.frames.len() == kept.about.views.len()) {
-        return dataset(path, kept, options);
+    let hit = entry.as_ref().and_then(Entry::read);
+    // Another program may have written an entry in which images are missing.
+    if let Some(hit) = hit.filter(|hit| hit.frames.len() == hit.summary.views.len()) {
+        return dataset(path, hit, options);
     }
     let scene = Scene::prepare(&source, &parameters)?;
     let (frames, points) = render(&scene);
     let surface_bytes = BUILD_FACTOR * scene.surface.bytes() as u64;
-    let about = About { views: scene.views, notes: scene.model.notes, surface_bytes };
-    let rendered = Rendered { about, frames, points };
+    let summary = Summary { views: scene.views, notes: scene.model.notes, surface_bytes };
+    let rendered = Rendered { summary, frames, points };
     if let Some(entry) = entry {
         entry.write(&rendered);
     }
     dataset(path, rendered, options)
 }
 
-/// Renders all views and collects points; depths and normals, which only the points need, are dropped.
+/// Renders all views and collects points. Depths, normals and triangles are then dropped, as nothing else needs them.
 fn render(scene: &Scene) -> (Vec<Frame>, InitPoints) {
     let mut collector = scene.point_collector();
     let mut frames = Vec::with_capacity(scene.views.len());
@@ -97,8 +97,8 @@ impl Dataset {
     /// When the surface exists but cannot be read.
     pub fn ground_truth(&self) -> Result<Option<GroundTruth>, LoadError> {
         if let Some(unpacked) = &self.unpacked {
-            let found = GroundTruth::open(unpacked.folder());
-            return found
+            let surface = GroundTruth::open(unpacked.folder());
+            return surface
                 .map_err(|error| LoadError::Data(unpacked.with_archive_name(&error.to_string())));
         }
         let Some(name) = super::name(&self.root) else { return Ok(GroundTruth::open(&self.root)?) };
@@ -125,11 +125,11 @@ impl From<densify_scenegen::Error> for LoadError {
 /// When the options leave no view to train on.
 fn dataset(
     path: &Path,
-    Rendered { about, frames, points }: Rendered,
+    Rendered { summary, frames, points }: Rendered,
     options: &LoadOptions,
 ) -> Result<Dataset, LoadError> {
     let mut photographs: Vec<Photograph> = (0..)
-        .zip(&about.views)
+        .zip(&summary.views)
         .zip(frames)
         .map(|((number, view), frame)| {
             let camera = camera(&view.camera);
@@ -151,10 +151,10 @@ fn dataset(
         points: PointCloud { positions: points.positions, colours: points.colours },
         tracks: sampler.finish(),
         own_split: true,
-        surface_bytes: Some(about.surface_bytes),
+        surface_bytes: Some(summary.surface_bytes),
         ..dataset::Scene::default()
     };
-    assemble(path, photographs, read, text_notes(about.notes), options)
+    assemble(path, photographs, read, text_notes(summary.notes), options)
 }
 
 /// Converts the camera of a rendered view.

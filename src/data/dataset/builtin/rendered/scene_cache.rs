@@ -13,12 +13,12 @@ use glam::DVec3;
 use safetensors::SafeTensors;
 use safetensors::tensor::{Dtype, TensorView};
 
-use super::{About, Rendered};
+use super::{Rendered, Summary};
 use densify_core::files::write_atomically;
 
-/// Largest size of all entries together `[bytes]`; the least recently used are removed first.
+/// Largest total size of all entries `[bytes]`; the least recently used entries are removed first.
 const MAX_BYTES: u64 = 1 << 30;
-const ENDING: &str = "safetensors";
+const EXTENSION: &str = "safetensors";
 const CHECKSUM: &str = "crc32c";
 
 /// The folder of cached scenes, if the user has a cache folder.
@@ -35,11 +35,11 @@ pub(super) struct Entry {
 impl Entry {
     /// The entry of the built-in scene `name`; `None` if the program's own file cannot be read.
     pub(super) fn new(folder: &Path, name: &str, options: &Options) -> Option<Self> {
-        let program = fingerprint(&std::env::current_exe().ok()?).ok()?;
+        let program = file_checksum(&std::env::current_exe().ok()?).ok()?;
         let parameters = crc32c::crc32c(format!("{options:?}").as_bytes());
         // Some systems do not allow the colon of `town:4` in file names.
         let name = name.replace(':', "-");
-        let name = format!("{name}-{program:08x}-{parameters:08x}.{ENDING}");
+        let name = format!("{name}-{program:08x}-{parameters:08x}.{EXTENSION}");
         Some(Self { path: folder.join(name) })
     }
 
@@ -65,9 +65,9 @@ impl Entry {
 
     fn try_write(
         &self,
-        Rendered { about, frames, points }: &Rendered,
+        Rendered { summary, frames, points }: &Rendered,
     ) -> Result<(), Box<dyn std::error::Error>> {
-        let about = serde_json::to_vec(about)?;
+        let summary = serde_json::to_vec(summary)?;
         let flat: Vec<f64> = points.positions.iter().flat_map(DVec3::to_array).collect();
         let counts: Vec<u32> = points.seen_by.iter().map(|views| views.len() as u32).collect();
         let seen_by = points.seen_by.concat();
@@ -78,7 +78,7 @@ impl Entry {
             tensors.push((image_name(index), TensorView::new(Dtype::U8, shape, &frame.rgba)?));
         }
         for (name, kind, shape, bytes) in [
-            ("about", Dtype::U8, vec![about.len()], &about[..]),
+            ("about", Dtype::U8, vec![summary.len()], &summary[..]),
             ("positions", Dtype::F64, vec![number, 3], bytemuck::cast_slice(&flat)),
             ("colours", Dtype::U8, vec![number, 3], points.colours.as_flattened()),
             ("view_counts", Dtype::U32, vec![number], bytemuck::cast_slice(&counts)),
@@ -126,8 +126,8 @@ fn decode(tensors: &SafeTensors<'_>) -> Option<Rendered> {
     let seen_by = counts.map(|count| seen.by_ref().take(count as usize).collect()).collect();
     // The other fields of the points are not used by datasets.
     let points = InitPoints { positions, colours, seen_by, ..InitPoints::default() };
-    let about: About = serde_json::from_slice(bytes("about")?).ok()?;
-    Some(Rendered { about, frames: frames?, points })
+    let summary: Summary = serde_json::from_slice(bytes("about")?).ok()?;
+    Some(Rendered { summary, frames: frames?, points })
 }
 
 fn frame(image: &TensorView<'_>) -> Option<Frame> {
@@ -145,7 +145,7 @@ fn frame(image: &TensorView<'_>) -> Option<Frame> {
 }
 
 /// The checksum of a file's contents.
-fn fingerprint(path: &Path) -> io::Result<u32> {
+fn file_checksum(path: &Path) -> io::Result<u32> {
     let mut file = File::open(path)?;
     let mut buffer = vec![0; 1 << 16];
     let mut sum = 0;
@@ -157,14 +157,14 @@ fn fingerprint(path: &Path) -> io::Result<u32> {
     }
 }
 
-/// Removes the least recently used entries until all together have at most `most` bytes.
-fn evict(folder: &Path, most: u64) -> io::Result<()> {
+/// Removes the least recently used entries until the total size is at most `max_bytes`.
+fn evict(folder: &Path, max_bytes: u64) -> io::Result<()> {
     let mut entries = Vec::new();
     for entry in fs::read_dir(folder)? {
         let entry = entry?;
         let metadata = entry.metadata()?;
         // Incomplete files left behind by killed processes are counted and removed like entries.
-        let is_entry = entry.path().extension().is_some_and(|ending| ending == ENDING);
+        let is_entry = entry.path().extension().is_some_and(|extension| extension == EXTENSION);
         if is_entry || entry.file_name().as_encoded_bytes().starts_with(b".densify-") {
             entries.push((metadata.modified()?, metadata.len(), entry.path()));
         }
@@ -172,7 +172,7 @@ fn evict(folder: &Path, most: u64) -> io::Result<()> {
     entries.sort();
     let mut total: u64 = entries.iter().map(|(_, bytes, _)| bytes).sum();
     for (_, bytes, path) in entries {
-        if total <= most {
+        if total <= max_bytes {
             break;
         }
         fs::remove_file(path)?;
@@ -207,8 +207,8 @@ mod tests {
         let camera = Camera::looking(DVec3::new(0.1, 0.2, 0.3), DVec3::X, DVec3::Y, 0.7, (2, 1));
         let view = |name: &str, split| View { name: name.to_owned(), split, camera };
         let views = vec![view("train/r_000", Split::Train), view("test/r_000", Split::Test)];
-        let about = About { views, notes: vec!["a note".to_owned()], surface_bytes: 5 };
-        Rendered { about, frames: vec![frame(3), frame(250)], points }
+        let summary = Summary { views, notes: vec!["a note".to_owned()], surface_bytes: 5 };
+        Rendered { summary, frames: vec![frame(3), frame(250)], points }
     }
 
     fn has_colon(path: &Path) -> bool {
@@ -227,9 +227,9 @@ mod tests {
         assert!(default.read().is_none());
         default.write(&sample());
         assert!(is_sample(default.read()));
-        // Other parameters make another entry.
+        // Scenes with different parameters have different entries.
         assert!(entry(&Options { seed: 9, ..Options::default() }).read().is_none());
-        // Another size makes another entry, too.
+        // So do scenes of different sizes.
         let sized = |name| Entry::new(folder.path(), name, &Options::default()).unwrap();
         let [town, larger] = ["town", "town:4"].map(sized);
         town.write(&sample());
@@ -251,15 +251,15 @@ mod tests {
     fn the_least_recently_used_entries_are_removed_first() {
         let folder = tempfile::tempdir().unwrap();
         for (name, age) in [("a", 30), ("b", 10), ("c", 20)] {
-            let path = folder.path().join(name).with_extension(ENDING);
+            let path = folder.path().join(name).with_extension(EXTENSION);
             fs::write(&path, [0; 100]).unwrap();
             let then = SystemTime::now() - std::time::Duration::from_secs(age);
             File::options().write(true).open(&path).unwrap().set_modified(then).unwrap();
         }
         fs::write(folder.path().join("other.txt"), [0; 900]).unwrap();
         evict(folder.path(), 200).unwrap();
-        let there = |name: &str| folder.path().join(name).with_extension(ENDING).exists();
-        assert_eq!(["a", "b", "c"].map(there), [false, true, true]);
+        let exists = |name: &str| folder.path().join(name).with_extension(EXTENSION).exists();
+        assert_eq!(["a", "b", "c"].map(exists), [false, true, true]);
         assert!(folder.path().join("other.txt").exists());
     }
 }

@@ -2,7 +2,7 @@
 
 use rayon::prelude::*;
 
-use super::rows::{Finder, Rows};
+use super::rows::{Rows, SolidRows};
 use super::visibility::Visibility;
 use super::{CentreErrors, KnownScene, ratio};
 use crate::metrics::EvaluateError;
@@ -10,12 +10,12 @@ use crate::metrics::EvaluateError;
 pub(super) fn errors(
     rows: &Rows,
     visibility: &Visibility,
-    ground: &KnownScene<'_>,
+    scene: &KnownScene<'_>,
 ) -> Result<CentreErrors, EvaluateError> {
-    let diagonal = ground.diagonal();
-    let finder = Finder::new(rows);
+    let diagonal = scene.diagonal();
+    let solid = SolidRows::new(rows);
     let to_centres: Vec<f64> =
-        visibility.samples.par_iter().map(|&sample| finder.distance(sample) / diagonal).collect();
+        visibility.samples.par_iter().map(|&sample| solid.distance(sample) / diagonal).collect();
     let to_mesh: Vec<(f64, f64)> = rows
         .distances
         .iter()

@@ -25,21 +25,21 @@ use visibility::Visibility;
 /// When a view cannot be read or rendered, and when the caller stops.
 pub fn measure(
     backend: &mut dyn Backend,
-    ground: &KnownScene<'_>,
+    scene: &KnownScene<'_>,
     train: &impl ViewSource,
     views: &impl ViewSource,
 ) -> Result<Geometry, EvaluateError> {
-    let rows = Rows::new(&backend.download()?, ground);
-    let visibility = Visibility::measure(backend, ground, &rows, train)?;
-    let mut pixels = Pixels::new(&rows, ground)?;
+    let rows = Rows::new(&backend.download()?, scene);
+    let visibility = Visibility::measure(backend, scene, &rows, train)?;
+    let mut pixels = Pixels::new(&rows, scene)?;
     for view in 0..views.count() {
         pixels.add(backend, views, view)?;
     }
     Ok(Geometry {
         depth: pixels.depth(),
         normal_error: pixels.normal_error(),
-        centres: centres::errors(&rows, &visibility, ground)?,
-        floaters: visibility.floaters(&rows, ground.diagonal()),
+        centres: centres::errors(&rows, &visibility, scene)?,
+        floaters: visibility.floaters(&rows, scene.diagonal()),
         thin: pixels.thin(),
         redundancy: visibility.redundancy(),
     })
@@ -52,9 +52,9 @@ impl KnownScene<'_> {
     }
 
     /// A view's camera in world coordinates, for projection and for ray casting.
-    fn cameras(&self, scene: &Camera) -> (Camera, densify_scenegen::Camera) {
-        let world = self.normalisation.world_from_scene_camera(scene);
-        let caster = densify_scenegen::Camera {
+    fn cameras(&self, camera: &Camera) -> (Camera, densify_scenegen::Camera) {
+        let world = self.normalisation.world_from_scene_camera(camera);
+        let ray_camera = densify_scenegen::Camera {
             width: world.width,
             height: world.height,
             fx: world.fx,
@@ -65,26 +65,26 @@ impl KnownScene<'_> {
             centre: world.centre(),
             lens: None,
         };
-        (world, caster)
+        (world, ray_camera)
     }
 
     /// Depth and normals of the surface in a view. Called once per view; returns an error if the caller asks to stop.
     fn g_buffer(
         &self,
         name: &str,
-        caster: &densify_scenegen::Camera,
+        ray_camera: &densify_scenegen::Camera,
     ) -> Result<GBuffer, EvaluateError> {
         if (self.is_stopped)() {
             return Err(EvaluateError::Stopped);
         }
-        let g_buffer = self.truth.g_buffer(name, caster);
+        let g_buffer = self.truth.g_buffer(name, ray_camera);
         g_buffer.map_err(|e| EvaluateError::View { view: name.to_owned(), source: e.into() })
     }
 }
 
 /// `sum / count`; NaN if `count` is 0.
 fn ratio(sum: f64, count: f64) -> f64 {
-    // An empty sum is −0.
+    // Adding 0 turns the −0 of an empty sum into 0.
     if count > 0.0 { (sum + 0.0) / count } else { f64::NAN }
 }
 

@@ -10,7 +10,7 @@ use densify_core::gaussians::{Gaussians, sigmoid};
 
 /// Opacity above which a row counts as part of the surface.
 const SOLID: f32 = 0.1;
-/// Number of nearest centres among which the row at a surface point is chosen.
+/// Number of rows with the nearest centres, from which the row at a surface point is chosen.
 const NEIGHBOURS: usize = 8;
 
 /// Rows as a structure of arrays, each of shape `[rows]`.
@@ -19,7 +19,7 @@ pub(super) struct Rows {
     pub(super) centres: Vec<DVec3>,
     /// Standard deviations `[world units]`.
     pub(super) scales: Vec<DVec3>,
-    /// Orientations, whose columns are the axes of the scales.
+    /// Rotation matrices; column i is the axis of scale i.
     pub(super) axes: Vec<DMat3>,
     /// Opacities.
     pub(super) opacities: Vec<f32>,
@@ -28,9 +28,9 @@ pub(super) struct Rows {
 }
 
 impl Rows {
-    pub(super) fn new(model: &Gaussians, ground: &KnownScene<'_>) -> Self {
-        let to_world = ground.normalisation;
-        let surface = ground.truth.surface();
+    pub(super) fn new(model: &Gaussians, scene: &KnownScene<'_>) -> Self {
+        let to_world = scene.normalisation;
+        let surface = scene.truth.surface();
         let vector = |v: &[f32; 3]| DVec3::from(v.map(f64::from));
         let centres: Vec<DVec3> =
             model.means.iter().map(|mean| to_world.world_from_scene(vector(mean))).collect();
@@ -54,13 +54,13 @@ impl Rows {
     }
 }
 
-/// Finds solid rows near a point.
-pub(super) struct Finder {
-    /// Centres with their rows.
+/// The solid rows, for finding those near a point.
+pub(super) struct SolidRows {
+    /// Centres, each with its row index.
     tree: RTree<GeomWithData<[f64; 3], usize>>,
 }
 
-impl Finder {
+impl SolidRows {
     pub(super) fn new(rows: &Rows) -> Self {
         let solid = (0..rows.len())
             .filter(|&row| rows.opacities[row] > SOLID && rows.centres[row].is_finite());
@@ -68,13 +68,13 @@ impl Finder {
         Self { tree: RTree::bulk_load(places.collect()) }
     }
 
-    /// Distance to the nearest solid centre; infinite if there is none.
+    /// Distance to the nearest centre `[world units]`; infinite if there is none.
     pub(super) fn distance(&self, place: DVec3) -> f64 {
         let nearest = self.tree.nearest_neighbor(place.to_array());
         nearest.map_or(f64::INFINITY, |hit| DVec3::from(*hit.geom()).distance(place))
     }
 
-    /// The shortest axis of the densest solid row at a point, among those with the nearest centres.
+    /// The shortest axis of the row that is densest at a point, among the [`NEIGHBOURS`] rows with the nearest centres.
     pub(super) fn normal(&self, rows: &Rows, place: DVec3) -> Option<DVec3> {
         let exponent = |row: usize| {
             let local = rows.axes[row].transpose() * (place - rows.centres[row]) / rows.scales[row];

@@ -60,9 +60,9 @@ fn square() -> Vec<[DVec3; 3]> {
     [[0, 1, 2], [0, 2, 3]].map(|t| t.map(|i: usize| corners[i])).to_vec()
 }
 
-/// Sides of a box.
+/// The triangles of a box.
 fn cuboid(low: DVec3, high: DVec3) -> Vec<[DVec3; 3]> {
-    let mut all = Vec::new();
+    let mut triangles = Vec::new();
     for axis in 0..3 {
         let (u, v) = ((axis + 1) % 3, (axis + 2) % 3);
         for end in [low, high] {
@@ -73,10 +73,10 @@ fn cuboid(low: DVec3, high: DVec3) -> Vec<[DVec3; 3]> {
             };
             let [a, b, c, d] =
                 [corner(low, low), corner(high, low), corner(high, high), corner(low, high)];
-            all.extend([[a, b, c], [a, c, d]]);
+            triangles.extend([[a, b, c], [a, c, d]]);
         }
     }
-    all
+    triangles
 }
 
 /// A ground truth of triangles; those from index `thin` on are thin structures.
@@ -132,14 +132,14 @@ fn measured(truth: &GroundTruth, world: &Gaussians) -> Geometry {
     let model = WORLD.model_from_world(world.clone());
     let options = Setup { needs: needs(), ..Setup::new(model.len().max(1)) };
     let mut backend = CpuBackend::new(&model, &options).unwrap();
-    let ground = KnownScene {
+    let scene = KnownScene {
         truth,
         normalisation: &WORLD,
         background: [0.0; 3],
         sh_degree: 0,
         is_stopped: &|| false,
     };
-    measure(&mut backend, &ground, &Pair::new(), &Pair::new()).unwrap()
+    measure(&mut backend, &scene, &Pair::new(), &Pair::new()).unwrap()
 }
 
 fn close(value: f64, expected: f64, tolerance: f64) {
@@ -194,7 +194,7 @@ fn invisible_rows_and_surfaces_do_not_count() {
     }
     let accuracy = measured(&truth(&square(), 2), &model).centres.accuracy;
     assert!(accuracy > 0.0 && accuracy < 0.05 * 0.5 / DIAGONAL, "{accuracy}");
-    // A surface behind the surface needs no rows, because it is hidden from both cameras.
+    // A second square behind the first needs no rows, because it is hidden from both cameras.
     let mut triangles = square();
     triangles.extend(square().into_iter().map(|t| t.map(|p| p + DVec3::Z)));
     let g = measured(&truth(&triangles, 4), &carpet(0.0));
@@ -214,12 +214,12 @@ fn a_tilt_of_normals_is_measured() {
 fn only_floaters_are_counted() {
     let truth = truth(&square(), 2);
     let small = DVec3::splat(0.02);
-    let with = |place: DVec3, scale: DVec3, opacity: f32| {
+    let floaters_with = |place: DVec3, scale: DVec3, opacity: f32| {
         let mut model = carpet(0.0);
         push(&mut model, place, scale, opacity);
         measured(&truth, &model).floaters
     };
-    let floater = with(DVec3::new(0.0, 0.0, -1.0), small, 0.9);
+    let floater = floaters_with(DVec3::new(0.0, 0.0, -1.0), small, 0.9);
     assert_eq!((floater.count, floater.of_rows), (1, 1.0 / 1601.0));
     // The nearly opaque floater covers 2π σ² at distance 2, which is 2π (0.02 · 32)² px in each of 2 views; the other
     // rows cover the square, 2 · (64 · 2 / 3)² px.
@@ -232,11 +232,11 @@ fn only_floaters_are_counted() {
         ("seen by one view", DVec3::new(-1.0, 0.0, -1.2), small, 0.9),
         ("behind the cameras", DVec3::new(0.0, 0.0, -4.0), small, 0.9),
     ];
-    for (what, place, scale, opacity) in cases {
-        assert_eq!(with(place, scale, opacity).count, 0, "{what}");
+    for (case, place, scale, opacity) in cases {
+        assert_eq!(floaters_with(place, scale, opacity).count, 0, "{case}");
     }
     // Beside the square the views see the background, so the space there is empty, too.
-    assert_eq!(with(DVec3::new(0.0, 1.2, 0.0), small, 0.9).count, 1);
+    assert_eq!(floaters_with(DVec3::new(0.0, 1.2, 0.0), small, 0.9).count, 1);
 }
 
 #[test]

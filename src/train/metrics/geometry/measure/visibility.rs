@@ -1,4 +1,4 @@
-//! Measures the weights of rows in the training views, and whether they lie in empty space.
+//! Measures the blend weights of rows in the training views, and finds the rows in empty space.
 
 use densify_policies::policy::{AuxColumn, AuxRequest};
 use densify_scenegen::GBuffer;
@@ -24,7 +24,7 @@ const MIN_OPACITY: f32 = 0.05;
 const MIN_DISTANCE: f64 = 0.01;
 /// Blend weight below which a row has a negligible effect.
 const NEGLIGIBLE: f32 = 0.01;
-/// Number of views that must see through a floater's position, or see a sample of the mesh.
+/// Minimum number of views that see through a floater's position, or that see a counted sample of the mesh.
 const MIN_VIEWS: u32 = 2;
 
 /// Sums over the training views.
@@ -34,7 +34,7 @@ pub(super) struct Visibility {
     /// Largest α·T of each row.
     peaks: Vec<f32>,
     /// Number of views that see through each row's position.
-    empty: Vec<u32>,
+    seen_through: Vec<u32>,
     /// Numbers of blended (row, pixel) pairs and of pixels.
     blended: (f64, f64),
     /// Samples of the mesh that are visible in enough views.
@@ -44,16 +44,16 @@ pub(super) struct Visibility {
 impl Visibility {
     pub(super) fn measure(
         backend: &mut dyn Backend,
-        ground: &KnownScene<'_>,
+        scene: &KnownScene<'_>,
         rows: &Rows,
         views: &impl ViewSource,
     ) -> Result<Self, EvaluateError> {
         let mut samples: Vec<(DVec3, u32)> =
-            sample(&ground.truth.surface().triangles()).into_iter().map(|p| (p, 0)).collect();
+            sample(&scene.truth.surface().triangles()).into_iter().map(|p| (p, 0)).collect();
         let mut visibility = Self {
             weights: vec![0.0; rows.len()],
             peaks: vec![0.0; rows.len()],
-            empty: vec![0; rows.len()],
+            seen_through: vec![0; rows.len()],
             blended: (0.0, 0.0),
             samples: Vec::new(),
         };
@@ -62,14 +62,14 @@ impl Visibility {
             let name = views.name(number);
             let failed = |source| EvaluateError::Backend { view: name.to_owned(), source };
             let camera = views.camera(number);
-            visibility.weigh(backend, ground, camera, &request).map_err(failed)?;
-            let (world, ray_camera) = ground.cameras(camera);
-            let g_buffer = ground.g_buffer(name, &ray_camera)?;
-            let places = visibility.empty.par_iter_mut().zip(&rows.centres);
-            places.for_each(|(empty, &place)| {
-                *empty += u32::from(sees_through(&world, &g_buffer, place));
+            visibility.add_weights(backend, scene, camera, &request).map_err(failed)?;
+            let (world, ray_camera) = scene.cameras(camera);
+            let g_buffer = scene.g_buffer(name, &ray_camera)?;
+            let places = visibility.seen_through.par_iter_mut().zip(&rows.centres);
+            places.for_each(|(seen_through, &place)| {
+                *seen_through += u32::from(sees_through(&world, &g_buffer, place));
             });
-            let surface = ground.truth.surface();
+            let surface = scene.truth.surface();
             let undecided = samples.par_iter_mut().filter(|(_, views)| *views < MIN_VIEWS);
             undecided.for_each(|(at, views)| {
                 let (pixel, depth) = ray_camera.project(*at);
@@ -83,10 +83,10 @@ impl Visibility {
     }
 
     /// Adds the blend weights of one view.
-    fn weigh(
+    fn add_weights(
         &mut self,
         backend: &mut dyn Backend,
-        ground: &KnownScene<'_>,
+        scene: &KnownScene<'_>,
         camera: &Camera,
         request: &AuxRequest,
     ) -> Result<(), densify_render::BackendError> {
@@ -100,9 +100,9 @@ impl Visibility {
             seed: 0,
             camera,
             target: &target,
-            background: ground.background,
+            background: scene.background,
             exposure: None,
-            sh_degree: ground.sh_degree,
+            sh_degree: scene.sh_degree,
             request,
         })?;
         for (column, values) in output.columns {
@@ -125,10 +125,10 @@ impl Visibility {
 
     /// True for a floater, by the definition of [`Floaters`].
     fn is_floater(&self, rows: &Rows, row: usize, diagonal: f64) -> bool {
-        let clear = (MIN_DISTANCE * diagonal).max(2.0 * rows.scales[row].max_element());
+        let min_distance = (MIN_DISTANCE * diagonal).max(2.0 * rows.scales[row].max_element());
         rows.opacities[row] > MIN_OPACITY
-            && rows.distances[row] > clear
-            && self.empty[row] >= MIN_VIEWS
+            && rows.distances[row] > min_distance
+            && self.seen_through[row] >= MIN_VIEWS
     }
 
     pub(super) fn floaters(&self, rows: &Rows, diagonal: f64) -> Floaters {
