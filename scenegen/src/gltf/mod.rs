@@ -117,7 +117,7 @@ pub(super) fn fault(path: &Path, element: impl Display, problem: impl Display) -
 /// Parses the JSON part. If the crate's types refuse it, it is rewritten in the form they expect, as glTF 2.0
 /// allows integers written as 1.0 (2.7.1), `extras` of any type (3.2), and scenes without nodes (5.25).
 fn parse(path: &Path, text: &[u8]) -> Result<json::Root, Error> {
-    let error = match json::deserialize::from_slice(text) {
+    let error = match json::Root::from_slice(text) {
         Ok(root) => return Ok(root),
         Err(error) => fault(path, "JSON", error.to_string()),
     };
@@ -133,7 +133,7 @@ fn parse(path: &Path, text: &[u8]) -> Result<json::Root, Error> {
     // The value is written as text again, because a second deserialiser of the whole format would take long to compile.
     // The original error has the line and column.
     let rewritten = serde_json::to_vec(&value).unwrap_or_default();
-    json::deserialize::from_slice(&rewritten).map_err(|_| error)
+    json::Root::from_slice(&rewritten).map_err(|_| error)
 }
 
 /// Removes `extras`, and writes whole numbers as integers.

@@ -85,10 +85,16 @@ fn check_loss(run: &Path, policy: &str, least_psnr: f64) {
     let log = records(&run.join("stats/train.jsonl"));
     assert_eq!(log.len(), ITERATIONS as usize / 10);
     assert_eq!(count(&log[log.len() - 1], "step"), u64::from(ITERATIONS));
-    let loss: Vec<f64> = log.iter().map(|record| number(record, "loss")).collect();
-    // `mini-splatting` resamples the model midway, so progress is measured from the worst loss.
-    let worst = loss.iter().copied().fold(loss[0], f64::max);
-    let first = if policy == "mini-splatting" { worst } else { loss[0] };
+    // Sampling restarts all Gaussians of `mini-splatting`, so progress is measured from the first record after it.
+    let events = records(&run.join("stats/events.jsonl"));
+    let sampled = events.iter().rfind(|event| event["cause"] == "sample");
+    let start = sampled.map_or(0, |event| count(event, "step"));
+    let loss: Vec<f64> = log
+        .iter()
+        .filter(|record| count(record, "step") > start)
+        .map(|record| number(record, "loss"))
+        .collect();
+    let first = loss[0];
     let last = loss[loss.len() - 1];
     // `vanilla` resets opacities midway and has little time to recover. `eagles` starts with small images, whose
     // loss is low.
