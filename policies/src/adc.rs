@@ -88,9 +88,10 @@ impl OpacityResets {
     }
 }
 
-/// Number of rows allowed at `step` by the concave growth curve N(x) = S + (B − S)(2x/M − (x/M)²) at
-/// event x of M, from S = `start` rows before the first event to B = `end` after the last (*Taming
-/// 3DGS*, Mallick et al. 2024, equation 2).
+/// Number of rows allowed at `step` by the concave growth curve N(x) = S + (B − S)(2x/M − (x/M)²) after
+/// x of the window's M intervals, from S = `start` rows at its start to B = `end` at its end (*Taming 3DGS*,
+/// Mallick et al. 2024, equation 2). If both ends are multiples of the interval, the last event is
+/// number M − 1, just below B, because the end is exclusive.
 pub fn concave_curve(window: Window, step: u32, start: usize, end: usize) -> usize {
     let Window { from, until, every } = window;
     if every == 0 {

@@ -30,7 +30,7 @@ pub(crate) fn assert_conforms(name: &str, sets: &[&str]) {
 }
 
 /// Asserts that the policy has the parameters of `vanilla`, and that at a growth step with the four rows of `event` it
-/// plans like `vanilla` with the settings `defaults`.
+/// plans like `vanilla` would if its defaults were changed to `defaults`.
 pub(crate) fn assert_grows_like_vanilla(name: &str, event: Event, defaults: &str) {
     // Averaged over 4 views, the gradients are just above 2e-4, just below it, and 1e-3; the last row is faint.
     let event = Event { budget: 9, ..event }

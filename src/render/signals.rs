@@ -133,7 +133,7 @@ impl RecordLayout {
     }
 }
 
-/// Returns whether the pixels in which each row has the largest blend weight are counted.
+/// True if each row's dominant pixels are counted: those in which no other row has a larger blend weight.
 pub(super) fn counts_dominant(needs: &Needs) -> bool {
     let in_views = |aux: &AuxRequest| aux.columns.contains(&AuxColumn::DominantPixels);
     needs.signals.contains(Signal::DominantPixels) || needs.aux.as_ref().is_some_and(in_views)
@@ -231,7 +231,7 @@ impl SignalPlanes {
 
 /// A signal that is read from the parameters.
 pub(super) struct ParameterSignal {
-    /// The parameters of a row.
+    /// Indices of the signal's values among a row's parameters.
     pub(super) parameters: Range<usize>,
     /// Converts a parameter to the signal's value.
     pub(super) convert: fn(f32) -> f32,

@@ -63,7 +63,8 @@ fn blending_thresholds_apply_to_the_forward_and_backward_pass() {
             let (rendering, measured) = outcome.expect("a small image is rendered");
             let name = subject.name();
             let case = format!("{name}, {alpha_min:.4}, {transmittance_min:e}");
-            // Near a threshold, only one renderer may blend a splat, which changes the pixel by about its alpha.
+            // Near a threshold, a splat may be blended by only one of the renderers; the pixel then differs by about the
+            // splat's alpha.
             let step = 1.5 * f64::from(alpha_min.max(transmittance_min).max(1.0 / 255.0));
             let tolerances = Limits { step, ..Limits::CPU };
             let outcome = compare_images(&rendering.rgb, &image.rgb, &image.boundary, tolerances);

@@ -53,15 +53,15 @@ pub enum Check {
     ReadsOnlyDeclared,
     /// It requests auxiliary views only if its needs say what to measure there.
     RequestsConsistently,
-    /// It rewrites rows, rotates children, or sets their scales or changes them separately for each axis, only if
-    /// its needs declare [detailed edits](crate::policy::Needs::detailed_edits).
+    /// Only if its needs declare [detailed edits](crate::policy::Needs::detailed_edits) does it rewrite rows, rotate
+    /// children, set their scales, or change their scales separately for each axis.
     DeclaresEdits,
     /// Every number in its needs is in its range, and at no step is its cadence longer or its resolution
     /// lower than declared.
     DeclaresValidNumbers,
     /// It plans without error or panic for any statistics and any refusals.
     NeverFails,
-    /// It does not replace the plan it was given, so rows and budget stay the same.
+    /// It does not replace the plan it was given by one for another number of rows or another budget.
     KeepsPlan,
     /// It leaves at least one row, unless the model was empty.
     LeavesARow,

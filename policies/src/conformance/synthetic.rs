@@ -20,7 +20,7 @@ pub(super) enum Pattern {
     Nan,
     /// Each value follows one of the patterns above.
     Mixture,
-    /// Each event follows one of the patterns above.
+    /// Each event follows one of the patterns above, chosen by the scenario (`pattern_at`).
     Changing,
 }
 

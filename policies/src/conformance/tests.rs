@@ -165,6 +165,7 @@ impl DensityPolicy for Faulty {
     fn cadence(&self, step: u32) -> Cadence {
         let all = if step > 100 { 3 } else { 1 };
         let sh_rest = if self.has(Fault::HasUndeclaredCadence) && step > 90 { 2 } else { 1 };
+        // An interval of 0 steps is invalid whatever the needs declare.
         Cadence { all: if sh_rest > 1 { 0 } else { all }, sh_rest }
     }
 

@@ -124,7 +124,7 @@ fn above_zero(name: &str, value: f64) -> Result<(), String> {
     if value.is_finite() && value > 0.0 {
         return Ok(());
     }
-    Err(format!("{name} is {value}; it must be positive"))
+    Err(format!("{name} is {value}; it must be finite and positive"))
 }
 
 /// Changes to the initial rows.

@@ -29,7 +29,7 @@ pub fn formats() -> &'static [&'static DatasetFormat] {
 /// # Errors
 /// When no format recognises the folder, or a file is unreadable or contradicts itself.
 pub(super) fn read_scene(root: &Root, options: &LoadOptions) -> Result<Scene, LoadError> {
-    // Only COLMAP has models to choose from.
+    // `sparse` names one of several COLMAP models, so no other format is tried.
     let chosen = options.sparse.is_some();
     for format in formats().iter().filter(|format| !chosen || format.name == colmap::FORMAT.name) {
         if let Some(scene) = (format.read)(root, options)? {

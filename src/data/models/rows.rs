@@ -59,7 +59,7 @@ impl Rows {
             opacity_logit: match row.opacity_logit {
                 f32::INFINITY => quantised_logit(1.0),
                 f32::NEG_INFINITY => quantised_logit(0.0),
-                finite => finite,
+                other => other,
             },
             ..row
         };

@@ -257,7 +257,7 @@ fn ffmpeg(folder: &Path, arguments: &[&OsStr]) -> std::io::Result<Output> {
     command.current_dir(folder).args(arguments).stdin(Stdio::null()).stdout(Stdio::null()).output()
 }
 
-/// Encodes the first pictures as a video, which gets its name only when it is complete.
+/// Encodes the first `frames` pictures as a video. The file `path` appears only when it is complete.
 fn encode(pictures: &Path, path: &Path, frames: u32, fps: u32) -> Result<(), FilmError> {
     let failed = |problem: String| FilmError::Encoding {
         path: path.to_owned(),
@@ -269,9 +269,9 @@ fn encode(pictures: &Path, path: &Path, frames: u32, fps: u32) -> Result<(), Fil
     let (rate, count) = (fps.to_string(), frames.to_string());
     // The pictures are named relative to their folder, because a % in its path would be part of the pattern.
     let input = ["-framerate", &rate, "-start_number", "0", "-i", "frame_%05d.png"];
-    // The folder may also hold pictures of an earlier, longer film. yuv420p halves the resolution of colour each way,
-    // so sides must be even.
+    // yuv420p halves the resolution of colour each way, so sides must be even.
     let even = "pad=ceil(iw/2)*2:ceil(ih/2)*2";
+    // The number of frames is given because the folder may also hold pictures of an earlier, longer film.
     let output =
         ["-frames:v", &count, "-vf", even, "-pix_fmt", "yuv420p", "-movflags", "+faststart"];
     let words = ["-y", "-loglevel", "error"].into_iter().chain(input).chain(output);

@@ -152,21 +152,21 @@ impl<'a> Trial<'a> {
         on_screen("mean2d_abs", measured.mean2d_abs.as_flattened(), flat(|s| s.mean_abs.to_vec()));
         on_screen("colour", measured.colour.as_flattened(), flat(|s| s.colour.to_vec()));
         on_screen("max_weight", &measured.max_weight, flat(|s| vec![s.max_weight]));
-        let close = boundary.iter().filter(|b| **b).count() as f64;
+        let boundary_pixels = boundary.iter().filter(|b| **b).count() as f64;
         let mut invisible = 0;
         for (row, expected) in rows.iter().enumerate() {
             let error = f64::from(measured.pixel_count[row].abs_diff(expected.pixels));
-            self.record(label, "pixel_count", error, close);
+            self.record(label, "pixel_count", error, boundary_pixels);
             let error = (f64::from(measured.sum_weight[row]) - expected.sum_weight).abs();
-            let flips = close * Limits::CPU.step;
+            let flips = boundary_pixels * Limits::CPU.step;
             self.record(label, "sum_weight", error, tolerance * expected.sum_weight + flips);
             invisible += usize::from(expected.pixels > 0 && !measured.visible[row]);
         }
         self.count(label, "rows blended but not visible", invisible);
     }
 
-    /// Trains for some steps and applies an edit; then every number of the model, of the optimiser and of an
-    /// image must be finite.
+    /// Trains for some steps and applies an edit; then the number of rows must be unchanged, and every number of
+    /// the model, of the optimiser and of an image finite.
     pub(super) fn train(
         &mut self,
         label: &str,
