@@ -129,8 +129,8 @@
 //!         let count = (self.0.share * now.rows() as f64) as usize;
 //!         let rows: Vec<u32> = (0..now.rows() as u32).collect();
 //!         // Keep at least one row, as an empty model could never grow again.
-//!         let faintest = count.min(now.rows().saturating_sub(1));
-//!         plan.prune_all(smallest(rows, now.signal(Signal::Opacity)?, faintest));
+//!         let pruned = count.min(now.rows().saturating_sub(1));
+//!         plan.prune_all(smallest(rows, now.signal(Signal::Opacity)?, pruned));
 //!         // Rows that were just pruned are refused here, and counted as denied.
 //!         for row in top_k(now.signal(Signal::WeightSum)?, count) {
 //!             let _ = plan.grow(row, split_by(1.6));

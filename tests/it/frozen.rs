@@ -14,7 +14,7 @@ use crate::subject::{all, make_with, on_each, repeatable, saved, step_input, sto
 const ROWS: usize = 190;
 /// Rows per task of the native backend, which allocates memory for whole tasks.
 const TASK: usize = 128;
-/// One task, a block of the next and part of another block.
+/// One task and, of the next, a block of 16 rows and part of another block.
 const FROZEN: usize = TASK + 21;
 
 fn view() -> Camera {
@@ -176,24 +176,30 @@ fn frozen_rows_have_no_memory_for_training() {
             .total()
     };
     // f32 numbers per row: two moments and a summed gradient for each of the 23 parameters of degree 1, two signal
-    // sums, and a mask with two moments. The two ages are added below: two bytes each, or one word on a GPU.
+    // sums, and a mask with two moments. The ages of a row and of its SH bands 1–3 are added below: two bytes each, or
+    // one word for both on a GPU.
     let numbers = 3 * 23 + 2 + 3;
     let native = |frozen: usize| total(&Subject::NATIVE, frozen);
     assert_eq!(native(0) - native(TASK), (TASK * (4 * numbers + 2 * 2)) as u64);
     assert_eq!(native(TASK), native(FROZEN), "memory is saved for whole tasks only");
     on_each(all(), |subject| {
         let Subject::Gpu(_) = subject else { return };
-        // In addition: three times the padding of the geometry, the word of ages, and the gradient of a row in the
-        // current view.
+        // In addition: one number of padding in each of the three arrays of moments and summed gradients, the word of
+        // ages, and the 20 numbers of a row's gradient in the current view.
         let bytes = 4 * (numbers + 3 + 1 + 20);
-        let padding = 16 * 16;
+        // The sizes of buffers are rounded up to 16 bytes.
+        let rounding = 16 * 16;
         let saved = total(subject, 0) - total(subject, FROZEN);
-        assert!(saved.abs_diff((FROZEN * bytes) as u64) < padding, "{saved} of {}", FROZEN * bytes);
+        assert!(
+            saved.abs_diff((FROZEN * bytes) as u64) < rounding,
+            "{saved} of {}",
+            FROZEN * bytes
+        );
     });
 }
 
 #[test]
-fn non_finite_rows_after_frozen_ones_are_found() {
+fn non_finite_rows_are_found_among_frozen_and_other_rows() {
     on_each(repeatable(), |subject| {
         let setup = setup(FROZEN, Storage::default(), Needs::default());
         let mut broken = model();

@@ -17,8 +17,9 @@ use crate::photographs::Photographs;
 use crate::subject::{devices, make_with, saved, storages};
 
 const ROWS: usize = 60;
-/// The PSNR is measured at steps 100 and 200; at step 200 it is also measured with the rows of lowest weight hidden.
+/// In a run of this length, the PSNR is measured at steps 100 and 200.
 const ITERATIONS: u32 = 250;
+/// The step of the last measurement, which is repeated with the rows of lowest weight hidden.
 const MEASURED_AT: u32 = 200;
 
 /// A policy that never edits.

@@ -36,6 +36,7 @@ impl Scenario {
     /// The pattern of the statistics at a step.
     pub(super) fn pattern_at(&self, step: u32) -> Pattern {
         match self.pattern {
+            // Every pattern but the last, which is `Changing` itself.
             Pattern::Changing => PATTERNS[step as usize % (PATTERNS.len() - 1)],
             pattern => pattern,
         }

@@ -237,7 +237,7 @@ impl DensityPolicy for Diet {
             signals = signals.with(Signal::ColourGradient);
         }
         if self.params.shift != Shift::None {
-            for axis in MEAN_GRADIENT {
+            for axis in POSITION_GRADIENT {
                 signals = signals.with(axis);
             }
         }
@@ -343,7 +343,8 @@ impl DensityPolicy for Diet {
     }
 }
 
-const MEAN_GRADIENT: [Signal; 3] =
+/// The sum over the views of dL/dμ, the gradient with respect to the mean, axis by axis.
+const POSITION_GRADIENT: [Signal; 3] =
     [Signal::MeanGradientX, Signal::MeanGradientY, Signal::MeanGradientZ];
 
 impl Diet {

@@ -1,6 +1,6 @@
 //! The children of a candidate: an optionally shifted clone, or a split.
 
-use super::{CloneOpacity, Diet, DietParams, MEAN_GRADIENT, Shift, Split};
+use super::{CloneOpacity, Diet, DietParams, POSITION_GRADIENT, Shift, Split};
 use crate::adc::{clone_at, split_by, split_long_axis};
 use crate::plan::{Offspring, OpacityRule, ParentFate, ScaleRule};
 use crate::policy::{PolicyResult, Signal, Snapshot};
@@ -36,7 +36,7 @@ impl Diet {
         if self.params.shift == Shift::None {
             return Ok([0.0; 3]);
         }
-        let [x, y, z] = MEAN_GRADIENT;
+        let [x, y, z] = POSITION_GRADIENT;
         let sum = [read(x)?, read(y)?, read(z)?];
         let factor = match self.params.shift {
             Shift::None => 0.0,

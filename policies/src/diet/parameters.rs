@@ -77,11 +77,11 @@ pub enum Split {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Shift {
-    /// Against the mean gradient, by at most `kappa` standard deviations.
+    /// Against the gradient with respect to the mean, by at most `kappa` standard deviations.
     Descent,
-    /// The sum of the gradients.
+    /// As in the paper: the sum of that gradient over the views.
     Paper,
-    /// The mean gradient divided by the number of views.
+    /// Like the published code: the average of that gradient over the views, divided by their number.
     Code,
     /// No offset.
     None,
@@ -113,7 +113,7 @@ pub enum Importance {
 pub enum NewbornSize {
     /// `size_pixels` pixels at the row's depth.
     Pixel,
-    /// As in the published code: the squared geometric mean of the largest scales of all rows.
+    /// As in the published code: the square of the geometric mean, over all rows, of each row's largest scale.
     Code,
 }
 

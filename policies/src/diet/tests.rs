@@ -81,7 +81,7 @@ fn event_quotas_add_up_to_the_share() {
     assert!(quarter.iter().all(|part| (531..=532).contains(part)));
     // Less than one row per event.
     assert_eq!(parts(0.25, window, 100).iter().sum::<usize>(), 25);
-    // Products that rounding puts just below an integer.
+    // As computed, 0.29 · 100 is just below 29; it counts as 29. 0.1 · 29 = 2.9 counts as 2.
     assert_eq!((share_of_budget(0.29, 100), share_of_budget(0.1, 29)), (29, 2));
     let once = Window { from: 500, until: 601, every: 100 };
     assert_eq!((parts(0.29, once, 100), parts(0.1, once, 29)), (vec![29], vec![2]));
@@ -180,11 +180,12 @@ fn new_rows_are_protected_for_an_epoch() {
 
 #[test]
 fn if_too_few_rows_are_old_the_oldest_new_ones_are_evicted() {
-    // One row is old and three must be pruned: the old one first, then the two of age 60 by importance.
+    // One row is old, and one must be pruned.
     let event = event(600, 6, 6)
         .with(Signal::ScreenGradient, &gradient_sums(6, &[5]))
         .with(Signal::Age, &[10.0, 60.0, 60.0, 59.0, 200.0, 0.0]);
     assert_eq!(run(&event, "rho = 47").pruned, [4]);
+    // Three must be pruned: the old one, and the two of age 60, the oldest of the others.
     let event = Event { budget: 3, ..event };
     let over = run(&event, "rho = 0.0");
     assert_eq!(over.pruned, [1, 2, 4]);

@@ -97,12 +97,13 @@ fn faint_rows_are_pruned_at_each_growth_step_and_first_at_step_300() {
     assert!(first.split.is_empty() && !first.ops.reset_signals.is_empty());
     let growing = run(&Event { step: 600, ..event.clone() }, "");
     assert_eq!(growing.pruned, [2, 3]);
-    // The curve allows ⌊100 · √(100/14000)⌋ = 8: all are drawn except NaN, and 0.6 · 0.004 is pruned.
+    // The curve allows ⌊100 · √(100/14000)⌋ = 8: all rows but the one with NaN are drawn. Row 2 is pruned, as its
+    // children would have an opacity of 0.6 · 0.004.
     assert_eq!((growing.split.len(), growing.ops.counts.denied), (2, 0));
     let all = event.clone().with(Signal::Opacity, &[0.001, 0.002, 0.001, 0.0]);
     assert_eq!(run(&all, "").pruned, [0, 2, 3]);
-    // If both fall on one step, the first prune comes before the draw. The curve allows two rows at a budget of 24,
-    // and the one remaining row is split, not the pruned ones, which have stronger edges.
+    // If the first prune and a growth step fall on one step, the prune comes before the draw. The curve allows two rows
+    // at a budget of 24, and the one remaining row is split, not the pruned ones, which have stronger edges.
     let budget = 24;
     let edges = vec![view(&[1e9, 1.0, 1e9, 1e9])];
     let event = Event { step: 600, budget, views: edges, ..event };
@@ -157,7 +158,8 @@ fn the_budget_holds_while_rows_are_split_and_pruned() {
     let full = event(14_600, &[1.0; 4], 4).with(Signal::Opacity, &[0.5, 0.004, 0.5, 0.5]);
     let done = run(&full, "");
     assert_eq!((&done.pruned[..], done.split.len(), done.ops.rows_after), (&[1][..], 0, 3));
-    // Room for one: one of four is split, or pruned if its children would be.
+    // Room for one: one of the four rows is drawn. If it is row 1, nothing is split, as its children would be too faint.
+    // Row 1 is pruned in any case.
     let room = run(&Event { budget: 5, ..full.clone() }, "");
     assert_eq!((room.pruned, room.ops.counts.denied), (vec![1], 0));
     assert!(room.split.len() <= 1);

@@ -20,7 +20,7 @@
 //! S = V^β · Σ over all training views, Σ over the pixels that the Gaussian is blended into, of o
 //!
 //! with o its opacity, V the product of its three standard deviations and β = `volume_power`. The
-//! published second share is the first, 0.5, times 0.8. With `schedule = "once"`, the other published
+//! published second share is 0.8 times the first: 0.8 · 0.5 = 0.4. With `schedule = "once"`, the other published
 //! form, the share `once_share` is pruned at `once_at`. A share of 0, or a step of 0, switches a prune off;
 //! if both prunes fall on one step, only the first takes place.
 //!

@@ -14,8 +14,8 @@
 //! 1. Gaussians with an opacity of at most `min_opacity` are dead. Each is replaced by a copy of a
 //!    living Gaussian, drawn with replacement in proportion to opacity.
 //! 2. The model grows by the factor 1 + `growth`, up to the budget, by further copies drawn in the same
-//!    way. An event that replaces n events of the published code grows by (1 + `growth`)ⁿ; n is 1 in a run of 30,000
-//!    steps with the default `grow_every`.
+//!    way. An event that stands for m events of the published code, as in a short run, grows by (1 + `growth`)ᵐ;
+//!    m is 1 in a run of 30,000 steps with the default `grow_every`.
 //!
 //! A Gaussian drawn n times becomes N = n + 1 equal ones that together render like the original. Each
 //! has the opacity o′ = 1 − (1 − o)^(1/N), at least `min_opacity`, and standard deviations multiplied
@@ -47,7 +47,7 @@
 //!   radius (scene extent / 1.1), as in gsplat's normalised scenes.
 //! - The published code grows by 5 % every 100 steps: 244 events multiply the model by up to 150,000. A run of
 //!   2,000 steps has 16 events; at 5 % each they would only double the model, whatever the budget. `growth` is
-//!   therefore per 100 steps of a run of 30,000, and each event applies it n = `grow_every` · 300 / iterations
+//!   therefore per 100 steps of a run of 30,000, and each event applies it m = `grow_every` · 300 / iterations
 //!   times: 15 times in a run of 2,000, so that each event doubles the model.
 //! - If no Gaussian is alive, nothing happens.
 //!
@@ -161,7 +161,7 @@ pub struct Mcmc {
     params: McmcParams,
     grow: Window,
     /// Factor on the number of rows at an event.
-    growth: f64,
+    growth_factor: f64,
 }
 
 impl ConfiguredPolicy for Mcmc {
@@ -182,8 +182,8 @@ impl ConfiguredPolicy for Mcmc {
         in_range("start_opacity", params.start_opacity, (Excluded(0.0), Excluded(1.0)))?;
         in_range("start_scale", params.start_scale, (Excluded(0.0), Unbounded))?;
         let McmcParams { grow_from: from, grow_until: until, grow_every: every, .. } = params;
-        let growth = growth_of_event(params.growth, every, scene.iterations);
-        Ok(Self { grow: Window { from, until, every }, growth, params })
+        let growth_factor = growth_factor(params.growth, every, scene.iterations);
+        Ok(Self { grow: Window { from, until, every }, growth_factor, params })
     }
 }
 
@@ -227,7 +227,7 @@ impl DensityPolicy for Mcmc {
         if dead.len() == now.rows() {
             return Ok(());
         }
-        let target = grown_rows(now.rows(), self.growth).min(plan.budget());
+        let target = grown_rows(now.rows(), self.growth_factor).min(plan.budget());
         let copies = dead.len() + target.saturating_sub(now.rows());
         if !dead.is_empty() {
             plan.cause("relocate");
@@ -245,15 +245,15 @@ impl DensityPolicy for Mcmc {
 
 /// The factor on the number of rows at events that are `every` steps apart. `growth` is per 100 steps of a
 /// run of 30,000. The factor may overflow to infinity.
-fn growth_of_event(growth: f64, every: u32, iterations: u32) -> f64 {
+fn growth_factor(growth: f64, every: u32, iterations: u32) -> f64 {
     let published = f64::from(REFERENCE_ITERATIONS / PUBLISHED_INTERVAL);
     (1.0 + growth).powf(f64::from(every) * published / f64::from(iterations.max(1)))
 }
 
-/// ⌊`growth`·`rows`⌋, at most `usize::MAX`.
-fn grown_rows(rows: usize, growth: f64) -> usize {
+/// ⌊`factor`·`rows`⌋, at most `usize::MAX`.
+fn grown_rows(rows: usize, factor: f64) -> usize {
     // A product just below an integer counts as that integer: its relative error is at most 2⁻⁵³.
-    (growth * rows as f64 * (1.0 + f64::EPSILON)).floor() as usize
+    (factor * rows as f64 * (1.0 + f64::EPSILON)).floor() as usize
 }
 
 impl Mcmc {

@@ -115,15 +115,15 @@ fn growth_per_event_compounds_in_short_runs() {
 fn extreme_growth_fills_the_budget_and_no_more() {
     for (growth, every, iterations) in [(0.05, u32::MAX, 30_000), (1.0, u32::MAX, 1), (1.0, 100, 0)]
     {
-        let factor = growth_of_event(growth, every, iterations);
+        let factor = growth_factor(growth, every, iterations);
         assert_eq!(grown_rows(3, factor).min(1000), 1000, "{growth} {every} {iterations}");
     }
     for (growth, every) in [(0.0, u32::MAX), (0.5, 0)] {
-        assert_eq!(grown_rows(3, growth_of_event(growth, every, 1)), 3);
+        assert_eq!(grown_rows(3, growth_factor(growth, every, 1)), 3);
     }
     // With the published interval and run length, the growth is exactly the published one.
     for growth in [0.0, 0.05, 0.1, 1.0] {
-        assert_eq!(growth_of_event(growth, 100, 30_000).to_bits(), (1.0 + growth).to_bits());
+        assert_eq!(growth_factor(growth, 100, 30_000).to_bits(), (1.0 + growth).to_bits());
     }
 }
 

@@ -72,13 +72,13 @@ fn all_unimportant_rows_are_replaced() {
     assert_eq!(most.pruned, [0, 1]);
     // At least `rho`, even if fewer are below the limit: 36 · 20 / 144 = 5.
     assert_eq!(run(&event, "replaceable = 0.3\nrho = 36.0").pruned, [0, 1, 2, 3, 4]);
-    // Newborns do not count.
+    // Newborns are not replaced.
     let mut age = vec![1000.0; 20];
     age[1] = 99.0;
     let young = event.clone().with(Signal::Age, &age);
     assert_eq!(run(&young, set).pruned, [0, 2]);
     assert_eq!(run(&young, &format!("{set}\nprotect = 99")).pruned, [0, 1, 2]);
-    // Nor do rows that are pruned anyway; these are replaced in addition.
+    // A row that is pruned for its opacity does not count as unimportant: three rows are replaced, not four.
     let mut opacity = vec![0.5; 20];
     opacity[0] = 0.004;
     let faint = run(&event.clone().with(Signal::Opacity, &opacity), set);

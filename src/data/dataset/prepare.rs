@@ -74,6 +74,7 @@ pub(super) fn assemble(
             continue;
         }
         let Photograph { views, hidden, held_out, id } = photograph;
+        // Without a mask, `hidden` is empty.
         let hidden = hidden.into_iter().chain(std::iter::repeat(false));
         let (out, views): (Vec<_>, Vec<_>) =
             views.into_iter().zip(hidden).partition(|(_, hidden)| *hidden);
@@ -162,8 +163,8 @@ fn first_names(names: &[impl AsRef<str>]) -> Option<String> {
 }
 
 fn refuse_duplicates(listing: &Path, frames: &[Frame]) -> Result<(), LoadError> {
-    // Absolute paths are matched by suffix, so that two may refer to one file, which could then be both trained on and
-    // held out.
+    // Absolute paths are matched by suffix. Two of them may therefore lead to one file, which could then be both trained
+    // on and held out.
     let mut by_image = HashMap::new();
     for frame in frames {
         let first = *by_image.entry(&frame.image).or_insert(frame);

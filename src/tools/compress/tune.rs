@@ -35,8 +35,8 @@ pub(super) fn tune(
     observer: &dyn Observer,
     after_stage: &mut dyn FnMut(&Gaussians) -> Result<(), Failure>,
 ) -> Result<Gaussians, Failure> {
-    let least = if matches!(options.to, Target::Bytes(_)) { 2 } else { 1 };
-    let stages = stages((model.len(), rows), options.iterations, least);
+    let least_stages = if matches!(options.to, Target::Bytes(_)) { 2 } else { 1 };
+    let stages = stages((model.len(), rows), options.iterations, least_stages);
     for (stage, &(mut budget, iterations)) in stages.iter().enumerate() {
         if stage > 0 {
             after_stage(&model)?;
@@ -46,7 +46,7 @@ pub(super) fn tune(
             budget = fit::rows_that_fit(options.to, format, &model)?.unwrap_or(1);
         }
         observer.say(format_args!(
-            "training {} of degree {} for {iterations} iterations ({} of {})",
+            "training {} of degree {} for {iterations} iterations (stage {} of {})",
             gaussians(budget),
             model.sh_degree,
             stage + 1,
@@ -95,11 +95,11 @@ fn assignment(text: &str) -> Result<Assignment, Failure> {
     text.parse().map_err(Failure::input)
 }
 
-/// The budget and the iterations of each stage. There are at least `least` stages, each budget is at least half of the
-/// one before, and the last stage is twice as long as the others.
-fn stages((whole, rows): (usize, usize), iterations: u32, least: u32) -> Vec<(usize, u32)> {
+/// The budget and the iterations of each stage. There are at least `least_stages` stages, each budget is at least half
+/// of the one before, and the last stage is twice as long as the others.
+fn stages((whole, rows): (usize, usize), iterations: u32, least_stages: u32) -> Vec<(usize, u32)> {
     let ratio = whole as f64 / rows.max(1) as f64;
-    let count = (ratio.log2().ceil() as u32).max(least).min(iterations);
+    let count = (ratio.log2().ceil() as u32).max(least_stages).min(iterations);
     let share = iterations / (count + 1);
     let stage = |number: u32| {
         if number == count {
@@ -130,9 +130,9 @@ fn describe_run(
         POLICY_SETTINGS.into_iter().map(assignment).collect::<Result<_, _>>()?;
     spec.schedule.iterations = Whole(iterations);
     spec.schedule.seed = options.seed;
-    if let Some(model) = options.exposure {
+    if let Some(exposure_model) = options.exposure {
         spec.schedule.exposure = ExposureChoice::On;
-        spec.schedule.exposure_model = model;
+        spec.schedule.exposure_model = exposure_model;
     }
     Ok(spec)
 }

@@ -184,7 +184,7 @@ mod tests {
     }
 
     #[test]
-    fn a_pair_shows_the_photograph_on_the_background_first() {
+    fn a_pair_shows_the_composited_photograph_on_the_left() {
         let image = Image8 {
             width: 2,
             height: 1,

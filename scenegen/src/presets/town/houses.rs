@@ -71,7 +71,7 @@ impl Town {
         for plot in 1..4 {
             let at = hedge.at(9.4 * (f64::from(plot) - 2.0), 0.6, 0.0);
             let material = self.materials.crowns[2];
-            self.block(&hedge, at, dvec3(0.25, 0.6, 7.5), material);
+            self.cuboid(&hedge, at, dvec3(0.25, 0.6, 7.5), material);
         }
     }
 
@@ -144,7 +144,7 @@ impl Town {
         let (aside, front) = (between(draws, -0.6, 0.6) * w, 0.35 * d);
         let (bottom, top) = (eaves + 0.5 * rise, eaves + rise + between(draws, 0.5, 1.1));
         let middle = place.at(aside, 0.5 * (bottom + top), front);
-        self.block(&place, middle, dvec3(0.35, 0.5 * (top - bottom), 0.3), shell.walls.plain);
+        self.cuboid(&place, middle, dvec3(0.35, 0.5 * (top - bottom), 0.3), shell.walls.plain);
     }
 
     /// A house with a flat roof behind a parapet, and a stairwell hut on the roof.
@@ -160,14 +160,14 @@ impl Town {
         let [high, thick] = PARAPET.map(|side| 0.5 * side);
         for sign in [-1.0, 1.0] {
             let middle = place.at(0.0, top + high, sign * (d - thick));
-            self.block(&place, middle, dvec3(w, high, thick), concrete);
+            self.cuboid(&place, middle, dvec3(w, high, thick), concrete);
             let middle = place.at(sign * (w - thick), top + high, 0.0);
-            self.block(&place, middle, dvec3(thick, high, d - 2.0 * thick), concrete);
+            self.cuboid(&place, middle, dvec3(thick, high, d - 2.0 * thick), concrete);
         }
         let hut = dvec3(1.2, 1.0, 1.0);
         let middle =
             place.at(between(draws, -0.5, 0.5) * w, top + hut.y, between(draws, -0.4, 0.4) * d);
-        self.block(&place, middle, hut, shell.walls.plain);
+        self.cuboid(&place, middle, hut, shell.walls.plain);
     }
 
     /// A balcony in every other bay of the front, on all upper floors.
@@ -180,7 +180,7 @@ impl Town {
                 let aside = 2.0 * w * ((f64::from(bay) + 0.5) / count - 0.5);
                 let up = FLOOR * f64::from(floor) + 0.45;
                 let middle = place.at(aside, up, d + 0.6);
-                self.block(&place, middle, dvec3(1.1, 0.5, 0.6), concrete);
+                self.cuboid(&place, middle, dvec3(1.1, 0.5, 0.6), concrete);
             }
         }
     }

@@ -160,8 +160,8 @@ impl Town {
         self.model.tiled(middle + dvec3(-x, 0.0, z), u, v, [0.0, 1.0], times, material);
     }
 
-    /// An upright box in the frame `place`, with half sides to the right, up and to the front.
-    fn block(&mut self, place: &LocalFrame, middle: DVec3, half: DVec3, material: u32) {
+    /// An upright box around `middle`, with half sides along the right, up and front of `place`.
+    fn cuboid(&mut self, place: &LocalFrame, middle: DVec3, half: DVec3, material: u32) {
         let corner = middle - place.direction(half.x, half.y, half.z);
         let sides = [(half.x, 0.0, 0.0), (0.0, 0.0, half.z), (0.0, half.y, 0.0)]
             .map(|(right, up, front)| 2.0 * place.direction(right, up, front));
@@ -190,11 +190,11 @@ impl Town {
 
     /// Streets, crossings, and the meadow around them. Each block adds its own ground.
     fn ground(&mut self, size: u32) {
-        let Materials { street, street_across, crossing: crossed, grass, .. } = self.materials;
+        let Materials { street, street_across, crossing, grass, .. } = self.materials;
         for column in 0..=size {
             for row in 0..=size {
                 let at = dvec3(street_at(size, column), 0.0, street_at(size, row));
-                self.level(at, [STREET; 2], [1.0; 2], crossed);
+                self.level(at, [STREET; 2], [1.0; 2], crossing);
                 if row < size {
                     let middle = at + 0.5 * PITCH * DVec3::Z;
                     self.level(middle, [STREET, BLOCK], [1.0, 4.0], street);

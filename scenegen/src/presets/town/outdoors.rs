@@ -95,9 +95,9 @@ impl Town {
     fn car(&mut self, place: &LocalFrame, draws: &mut Draws) {
         let (coat, glass) = (one_of(draws, &self.materials.car_paint), self.materials.glass);
         let rubber = self.materials.rubber;
-        self.block(place, place.at(0.0, 0.65, 0.0), dvec3(0.85, 0.35, 2.1), coat);
-        self.block(place, place.at(0.0, 1.2, -0.25), dvec3(0.72, 0.2, 1.15), glass);
-        self.block(place, place.at(0.0, 1.43, -0.25), dvec3(0.74, 0.03, 1.05), coat);
+        self.cuboid(place, place.at(0.0, 0.65, 0.0), dvec3(0.85, 0.35, 2.1), coat);
+        self.cuboid(place, place.at(0.0, 1.2, -0.25), dvec3(0.72, 0.2, 1.15), glass);
+        self.cuboid(place, place.at(0.0, 1.43, -0.25), dvec3(0.74, 0.03, 1.05), coat);
         for (aside, ahead) in [(-0.8, -1.3), (0.8, -1.3), (-0.8, 1.3), (0.8, 1.3)] {
             let [inner, outer] = [0.85, 1.1].map(|share| place.at(share * aside, 0.33, ahead));
             self.model.cylinder(inner, outer, 0.33, 10, rubber);
