@@ -81,9 +81,9 @@ impl ColourTransform {
         let matrix = std::array::from_fn(|i| {
             // Σ gᵢ·C over the colours C before the transform, minus the background's contribution.
             let exposed = DVec3::from(sums.by_colour[i]) - sums.plain[i] * DVec3::from(offset);
-            let plain = inverse * exposed;
-            let through = sums.behind[i] * DVec3::from(behind.map(f64::from));
-            (plain - through).as_vec3().to_array()
+            let unexposed = inverse * exposed;
+            let of_background = sums.behind[i] * DVec3::from(behind.map(f64::from));
+            (unexposed - of_background).as_vec3().to_array()
         });
         let offset = std::array::from_fn(|i| (sums.plain[i] - sums.behind[i]) as f32);
         ColourGradient { matrix, offset }

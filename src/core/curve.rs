@@ -1,7 +1,7 @@
 //! Morton codes (Morton 1966): positions on a Z-order curve through space, by which the initial rows are sorted.
 //!
-//! Neighbours in memory are then neighbours in the scene: the rows of a block are mostly visible together or not
-//! at all, and the rows in a tile of the image share cache lines.
+//! Neighbours in memory are then neighbours in the scene: of rows that are processed together, mostly all or none are
+//! visible, and the rows in a tile of the image share cache lines.
 
 /// Bits per axis.
 const BITS: u32 = 10;

@@ -35,7 +35,7 @@ pub fn rows(text: &str) -> Result<usize, String> {
     }
     if !(1.0..=MAX_ROWS).contains(&whole) {
         return Err(format!(
-            "`{text}` is out of range; a model has between 1 and 4 billion Gaussians"
+            "`{text}` is out of range; a model has at least 1 and at most 4 billion Gaussians"
         ));
     }
     Ok(whole as usize)

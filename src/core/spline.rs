@@ -1,6 +1,7 @@
 //! Splines through equally spaced values.
 
-/// Weights of four consecutive values at `t` in `[0, 1]` between the second and the third (Catmull and Rom 1974).
+/// Weights of four consecutive values that interpolate between the second (`t` = 0) and the third (`t` = 1) of them
+/// (Catmull and Rom 1974).
 pub fn catmull_rom(t: f64) -> [f64; 4] {
     let (t2, t3) = (t * t, t * t * t);
     [

@@ -22,7 +22,7 @@ pub enum NumberKind {
 pub struct NonFinite {
     /// Index of the row.
     pub row: u32,
-    /// The array that the number or its parameter belongs to.
+    /// The array of the parameter, which is non-finite or has a non-finite moment.
     pub array: ModelArray,
     /// The kind of number.
     pub kind: NumberKind,

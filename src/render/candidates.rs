@@ -38,7 +38,7 @@ impl<'a> Photograph<'a> {
     }
 }
 
-/// The error and the number of a pixel.
+/// The error of a pixel and its number, y·width + x.
 pub(super) type RankedPixel = (f32, u32);
 
 /// Number of pixels ranked per candidate, so that enough remain after spacing, which keeps only local maxima.
@@ -70,12 +70,11 @@ impl Candidates {
 
     /// Restores the list from [`tensor`](Self::tensor).
     pub(super) fn restore(&mut self, tensor: Tensor) -> Result<(), StateError> {
-        let most = self.request.map_or(0, |r| r.capacity);
+        let capacity = self.request.map_or(0, |r| r.capacity);
         let count = tensor.shape.first().copied().unwrap_or(0);
-        if count > most {
-            return Err(
-                tensor.error(format!("it has {count} candidates; this run holds at most {most}"))
-            );
+        if count > capacity {
+            let problem = format!("it has {count} candidates; this run holds at most {capacity}");
+            return Err(tensor.error(problem));
         }
         let values = tensor.into_f32(&[count, VALUES])?;
         let candidate = |&[x, y, z, r, g, b, pixel_size, error]: &[f32; VALUES]| Candidate {

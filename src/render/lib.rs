@@ -46,7 +46,7 @@ pub use inspect::Inspect;
 pub use setup::{KeptPhotographs, MomentStorage, ParameterStorage, Setup, Shortcuts, Storage};
 pub use state::{StateArray, StateError, Tensor, Values};
 
-/// Learning rates of one iteration. With the default, 0, the model is unchanged, while signals are still measured.
+/// Learning rates of one iteration. If all are 0, the default, the model is unchanged, but signals are still measured.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct LearningRates {
     /// Means `[scene units per step]`.
@@ -92,7 +92,7 @@ pub struct StepInput<'a> {
     pub noise: Option<NoiseTerm>,
     /// Intervals of the optimiser's steps, no longer than those the backend was set up for.
     pub cadence: Cadence,
-    /// Seed of the run, for noise on the means.
+    /// Seed of the run, for noise on the means and for stochastic rounding.
     pub seed: u64,
 }
 
@@ -135,7 +135,7 @@ pub struct AuxOutput {
 pub struct StepOutput {
     /// 0.8·L1 + 0.2·(1 − SSIM), without the terms that a policy adds.
     pub loss: f32,
-    /// Mean over pixels and channels of |I − G|.
+    /// Mean over pixels and channels of |rendering − photograph|.
     pub l1: f32,
     /// Mean structural similarity.
     pub ssim: f32,

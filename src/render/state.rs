@@ -24,7 +24,7 @@ impl StateArray {
         Self { name: name.into(), by_rows: true }
     }
 
-    /// A small array of another shape.
+    /// A small array that does not have one entry per row.
     pub(super) fn small(name: impl Into<String>) -> Self {
         Self { name: name.into(), by_rows: false }
     }

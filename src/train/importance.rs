@@ -71,7 +71,7 @@ pub fn footprints(model: &Gaussians) -> Vec<f64> {
     (0..model.len()).map(footprint).collect()
 }
 
-/// The `count` most important rows in ascending order; among equally important rows, the first.
+/// The `count` most important rows, sorted by index; of equally important rows, the first.
 pub fn largest(importance: &[f64], count: usize) -> Vec<usize> {
     let mut rows: Vec<usize> = (0..importance.len()).collect();
     rows.sort_by(|&a, &b| importance[b].total_cmp(&importance[a]));
@@ -85,7 +85,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_most_important_rows_are_in_ascending_order() {
+    fn the_most_important_rows_are_sorted_by_index() {
         assert_eq!(largest(&[1.0, 3.0, 0.0, 3.0, 2.0], 3), [1, 3, 4]);
         assert_eq!(largest(&[1.0, 1.0, 1.0], 2), [0, 1]);
         assert_eq!(largest(&[1.0], 5), [0]);

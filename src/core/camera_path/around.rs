@@ -11,12 +11,13 @@ use crate::camera::Camera;
 const KEYFRAMES: u32 = 48;
 /// Number of turns of a spiral.
 const TURNS: f64 = 2.0;
-/// Directions count as coplanar if less than this fraction of the sum of their squared lengths is normal to the plane.
-/// This allows a root mean square roll of 13°.
+/// Unit vectors count as coplanar if the mean square of their components normal to the plane is less than this, which
+/// allows a root mean square roll of 13°.
 const MAX_NORMAL_FRACTION: f64 = 0.05;
-/// Coplanar directions count as collinear if at most this fraction of that sum is along the plane's second axis.
+/// Coplanar unit vectors count as collinear if the mean square of their components along the minor axis of their
+/// distribution in the plane is at most this.
 const MAX_LINE_FRACTION: f64 = 0.1;
-/// The quantile of the cameras' offsets from their centre that is used as the radius of a spiral.
+/// The quantile of the cameras' offsets from their centre, along an axis, that is the radius of a spiral on this axis.
 const REACH_QUANTILE: f64 = 0.9;
 
 /// Common properties of a set of cameras.
@@ -36,7 +37,7 @@ struct Rig {
 }
 
 impl Rig {
-    /// Computes the properties of at least one camera.
+    /// Computes the common properties of `cameras`, which must not be empty.
     fn new(cameras: &[Camera]) -> Self {
         let mean = |vector: &dyn Fn(&Camera) -> DVec3| {
             cameras.iter().map(vector).sum::<DVec3>() / cameras.len() as f64

@@ -103,7 +103,7 @@ fn replace<E>(
     Ok(())
 }
 
-/// The depth of a run's folders: `point_cloud/iteration_N`.
+/// Levels of subfolders in a run's folder: two, as in `point_cloud/iteration_N`.
 pub const RUN_FOLDER_DEPTH: u32 = 2;
 
 /// Removes temporary files from a folder and from its subfolders down to `depth` levels below it.

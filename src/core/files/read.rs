@@ -5,7 +5,7 @@ use std::fs::{File, OpenOptions};
 use std::io::{self, Read};
 use std::path::Path;
 
-/// The message for text in another encoding, often caused by a file name in the text.
+/// The message for a file that is not UTF-8, often only because of a file name that it contains.
 pub(super) const NOT_UTF8: &str = "it is not text in UTF-8; save it as UTF-8, and rename files whose names are in another encoding";
 /// Maximum size of a file that holds options `[bytes]`.
 pub const MAX_OPTIONS_BYTES: u64 = 4 << 20;
@@ -33,7 +33,7 @@ pub fn open(path: &Path) -> io::Result<File> {
 /// Reads a text of at most `limit` bytes, without the byte-order mark that some editors write.
 ///
 /// # Errors
-/// The errors of [`open`]; when the file is larger, or not text in UTF-8.
+/// The errors of [`open`], and when the file is larger than `limit` or not text in UTF-8.
 pub fn read_text(path: &Path, limit: u64) -> io::Result<String> {
     let mut bytes = Vec::new();
     open(path)?.take(limit + 1).read_to_end(&mut bytes)?;

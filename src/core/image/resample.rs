@@ -134,7 +134,7 @@ mod tests {
     }
 
     #[test]
-    fn halving_averages_blocks() {
+    fn halving_averages_two_by_two_pixels() {
         let out = shrink(&grey(4, 2, &[0, 100, 10, 10, 200, 100, 10, 10]), 2, 1);
         assert_eq!(out, grey(2, 1, &[100, 10]));
     }

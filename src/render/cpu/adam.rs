@@ -1,4 +1,4 @@
-//! Stage 7: Adam (Kingma and Ba 2015, algorithm 1), with the bias correction of each row's own age, its number of
+//! Stage 7: Adam (Kingma and Ba 2015, algorithm 1). Each row's bias is corrected by its own age, the number of its
 //! steps.
 //!
 //! A new row starts with zero moments and age 0, so that its first step has the length of one learning rate. With
@@ -54,7 +54,7 @@ impl BiasCorrection {
     }
 }
 
-/// The learning rate of a plane.
+/// The learning rate of plane `p`: the parameter with index `p` of every row.
 fn rate(rates: &LearningRates, p: usize) -> f32 {
     match p {
         0..plane::LOG_SCALE => rates.mean,
@@ -132,10 +132,10 @@ pub(super) fn confine<S: Simd>(s: S, params: &mut [f32], slack: f32) {
     }
 }
 
-/// Clamps x to [least, most]; NaN stays NaN.
+/// Clamps x to the bounds, which are included; NaN stays NaN.
 #[inline(always)]
 fn clamp<S: Simd>(s: S, x: V<S>, bounds: [f32; 2]) -> V<S> {
-    let [least, most] = each!(i in 2 => V::splat(s, bounds[i]));
-    let x = x.lt(least).select(least, x);
-    most.lt(x).select(most, x)
+    let [min, max] = each!(i in 2 => V::splat(s, bounds[i]));
+    let x = x.lt(min).select(min, x);
+    max.lt(x).select(max, x)
 }

@@ -74,7 +74,7 @@ pub(super) fn apply(model: &mut Model<'_>, ops: &RowOps, rng: &PolicyRng) {
 }
 
 impl Model<'_> {
-    /// Writes a family: the children of a parent, then the parent itself.
+    /// Writes a family: the children of a parent, then the parent itself if it becomes child 0.
     fn write_family(&mut self, row: u32, offspring: &Offspring, children: &[u32], rng: &PolicyRng) {
         let parent = row as usize;
         let mean: [f32; 3] = self.params.get_n(parent, plane::MEAN);
@@ -106,18 +106,18 @@ impl Model<'_> {
             };
             [0, 1, 2].map(|i| mean[i] + offset[i])
         };
-        let rewrite = |model: &mut Self, slot: usize, child: u32| {
-            model.params.set_n(slot, plane::MEAN, position(child));
-            model.params.set_n(slot, plane::LOG_SCALE, scales);
-            model.params.set_n(slot, plane::QUAT, rotated);
-            model.set_opacity(slot, offspring.opacity, siblings);
-            model.reset_row(slot);
+        let rewrite = |model: &mut Self, to: usize, child: u32| {
+            model.params.set_n(to, plane::MEAN, position(child));
+            model.params.set_n(to, plane::LOG_SCALE, scales);
+            model.params.set_n(to, plane::QUAT, rotated);
+            model.set_opacity(to, offspring.opacity, siblings);
+            model.reset_row(to);
         };
-        for (child, &slot) in (1..).zip(children) {
-            let slot = slot as usize;
-            self.params.edit(RowEdit::Copy(parent, slot));
-            self.masks.inherit(parent, slot);
-            rewrite(self, slot, child);
+        for (child, &to) in (1..).zip(children) {
+            let to = to as usize;
+            self.params.edit(RowEdit::Copy(parent, to));
+            self.masks.inherit(parent, to);
+            rewrite(self, to, child);
         }
         if offspring.parent == ParentFate::BecomesChild {
             rewrite(self, parent, 0);
@@ -160,7 +160,7 @@ impl Model<'_> {
 
     fn decay(&mut self, decay: Decay, rows: Range<usize>) {
         let seen = self.signals.planes.current(Signal::VisibleCount);
-        let shrunk = (1.0 - decay.scale).ln();
+        let log_factor = (1.0 - decay.scale).ln();
         for row in rows {
             let was_seen = seen.is_some_and(|plane| self.signals.blocks.get(row, plane) > 0.0);
             if decay.seen_only && !was_seen {
@@ -176,7 +176,7 @@ impl Model<'_> {
                 self.params.set(row, plane::OPACITY, old.min((decayed / transparency).ln()));
             }
             if decay.scale > 0.0 {
-                let scales = self.params.get_n::<3>(row, plane::LOG_SCALE).map(|x| x + shrunk);
+                let scales = self.params.get_n::<3>(row, plane::LOG_SCALE).map(|x| x + log_factor);
                 self.params.set_n(row, plane::LOG_SCALE, scales);
             }
         }

@@ -15,8 +15,8 @@ impl CpuBackend {
         let planes = planes(self.sh_degree);
         let find = |row: usize| {
             let first = |get: &dyn Fn(usize) -> f32, kind| {
-                let number = (0..planes).position(|plane| !get(plane).is_finite())?;
-                let array = ModelArray::of_parameter(number);
+                let plane = (0..planes).position(|plane| !get(plane).is_finite())?;
+                let array = ModelArray::of_parameter(plane);
                 Some(NonFinite { row: row as u32, array, kind })
             };
             let moment = |order: usize| {

@@ -1,5 +1,5 @@
-//! Batches of splats from a tile's list, copied side by side with the parts of their coordinates that are constant
-//! within a patch or the same in all patches.
+//! Batches of splats from a tile's list. A tile is divided into patches of 4×4 pixels. The coordinates (u, z) of a pixel
+//! (see [`project`](super::project)) are stored per splat as two summands: one for the patch, one for the pixel in it.
 //!
 //! A batch is filled before any of its patches is rendered. Which splats reach a patch is then known before the loop
 //! over these splats starts, so that the loop's exit depends on a finished bit mask, not on arithmetic in flight.
@@ -16,13 +16,13 @@ use super::tiles::Entry;
 /// Number of splats in a batch. They are copied before use, so that their cache misses overlap.
 pub(super) const BATCH: usize = 32;
 
-/// Pixel centres within a patch, and corners of a tile's patches.
+/// Pixel centres relative to their patch's upper left corner, and these corners relative to that of the tile `[px]`.
 pub(super) const LANE_X: [f32; WIDTH] = grid(true, 1.0, 0.5);
 pub(super) const LANE_Y: [f32; WIDTH] = grid(false, 1.0, 0.5);
 pub(super) const CORNER_X: [f32; PATCHES] = grid(true, PATCH as f32, 0.0);
 pub(super) const CORNER_Y: [f32; PATCHES] = grid(false, PATCH as f32, 0.0);
 
-/// One coordinate of the points of a 4×4 grid, row by row.
+/// One coordinate (x or y) of the points of a 4×4 grid, row by row.
 const fn grid(x: bool, step: f32, first: f32) -> [f32; WIDTH] {
     let mut values = [0.0; WIDTH];
     let mut i = 0;
@@ -38,13 +38,13 @@ const fn grid(x: bool, step: f32, first: f32) -> [f32; WIDTH] {
 #[repr(C, align(64))]
 pub(super) struct Batch {
     pub(super) splats: [Splat; BATCH],
-    /// u and z of a patch's pixels relative to its upper left corner, per splat.
+    /// u and z of a patch's pixels minus those of its upper left corner, per splat.
     within_u: [[f32; WIDTH]; BATCH],
     within_z: [[f32; WIDTH]; BATCH],
-    /// u and z of the patches' corners, per splat.
+    /// u and z of the patches' upper left corners, per splat.
     corner_u: [[f32; PATCHES]; BATCH],
     corner_z: [[f32; PATCHES]; BATCH],
-    /// For each patch a bit per splat: whether the splat may be blended into one of the patch's pixels.
+    /// A bit per splat for each patch, set if the splat may be blended into one of the patch's pixels.
     pub(super) splats_of: [u32; PATCHES],
     /// The same information as a bit per patch, for each splat.
     pub(super) patches_of: [u32; BATCH],

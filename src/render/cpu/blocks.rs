@@ -1,4 +1,4 @@
-//! Parameters in blocks of sixteen rows: `[block][plane][lane]`.
+//! Parameters in blocks of sixteen rows: `[block][plane][lane]`. A plane is one parameter, a lane one row of the block.
 //!
 //! A kernel processes sixteen rows at a time and finds each of their parameters in one aligned cache line. A thread
 //! owns whole blocks, so that stages need no locks. The parameters of a row are within four kilobytes, while planes
@@ -219,8 +219,8 @@ impl<T> BlockTask<'_, T> {
     }
 }
 
-/// Splits a buffer for the tasks of a parallel loop into parts of equal length, except the last; an empty buffer gives
-/// every task an empty part.
+/// Splits a buffer into a part of `per_task` items for each task of a parallel loop. Where the buffer ends, parts are
+/// shorter or empty.
 ///
 /// The iterator's type is the same for buffers with and without data: with two types, a loop over ten buffers
 /// would be compiled for each of a thousand combinations.

@@ -36,7 +36,8 @@ pub(super) fn record_cap(options: &Setup) -> usize {
     if options.only_renders { 1 } else { options.record_cap.clamp(1, tile_cap(options)) }
 }
 
-/// The rows of the tasks that have trainable rows. Earlier rows are frozen and have memory only for rendering.
+/// The rows of the optimiser's tasks that have trainable rows. Earlier rows are frozen and need memory only for
+/// rendering.
 pub(super) fn trained(options: &Setup) -> Range<usize> {
     if options.only_renders {
         return 0..0;
@@ -192,12 +193,12 @@ mod tests {
                 + size_of_val(&backend.records[..]);
             (bytes, backend.ledger.total(), backend.render(&camera, [0.1; 3], 0).unwrap())
         });
-        let [(total, planned, expected), (bytes, less, rendering)] = results;
-        assert!(bytes < 64 && total - bytes == (planned - less) as usize, "{bytes} of {total}");
+        let [(full, full_planned, expected), (bytes, planned, rendering)] = results;
+        assert!(bytes < 64 && full - bytes == (full_planned - planned) as usize, "{bytes}, {full}");
         assert!(rendering == expected);
     }
 
-    /// Budgets around 2³¹ and 2³² rows, and one beyond what a slot number can address.
+    /// Budgets around 2³¹ and 2³² rows, and one of 2⁴⁰, which needs more memory than the address space has.
     #[test]
     fn huge_budgets_do_not_wrap_and_the_largest_is_refused() {
         let model = Gaussians { sh_degree: 3, ..Gaussians::default() };
@@ -207,7 +208,7 @@ mod tests {
             // Parameters and moments: 59 numbers of four bytes, three times.
             let model_bytes = 3 * 59 * 4 * budget as u128;
             assert!(u128::from(ledger.total()) >= model_bytes, "{budget} rows");
-            assert!(tile_cap(&options) <= u32::MAX as usize, "a slot is a u32");
+            assert!(tile_cap(&options) <= u32::MAX as usize, "pairs are numbered by u32");
         }
         // More than the address space: refused before anything is allocated.
         let options = Setup { threads: Some(1), ..Setup::new(1 << 40) };

@@ -39,8 +39,8 @@ pub(super) fn rank(
         ranking.resize(pixels, (0.0, 0));
     }
     let ranking = &mut ranking[..pixels];
-    let mut part = LINES * width.max(1);
-    let tasks = ranking.par_chunks_mut(part).enumerate();
+    let mut per_task = LINES * width.max(1);
+    let tasks = ranking.par_chunks_mut(per_task).enumerate();
     let mut kept = threads.collect("rank", tasks, |(task, ranking)| {
         let mut ranked = 0;
         for at in 0..ranking.len() {
@@ -53,16 +53,16 @@ pub(super) fn rank(
         keep_worst(&mut ranking[..ranked], count)
     });
     while kept.len() > 1 {
-        let tasks = ranking.par_chunks_mut(LISTS * part).zip(kept.par_chunks(LISTS));
+        let tasks = ranking.par_chunks_mut(LISTS * per_task).zip(kept.par_chunks(LISTS));
         kept = threads.collect("rank", tasks, |(ranking, kept)| {
             let mut ranked = 0;
             for (i, &kept) in kept.iter().enumerate() {
-                ranking.copy_within(i * part..i * part + kept, ranked);
+                ranking.copy_within(i * per_task..i * per_task + kept, ranked);
                 ranked += kept;
             }
             keep_worst(&mut ranking[..ranked], count)
         });
-        part *= LISTS;
+        per_task *= LISTS;
     }
     kept.first().copied().unwrap_or(0)
 }
@@ -134,7 +134,7 @@ mod tests {
     use super::*;
     use crate::candidates::Candidates;
 
-    /// Images of one line, of a few tasks, and of several rounds of merging, with equal errors among them.
+    /// Images that take one task, a few tasks, and several rounds of merging; many pixels have equal errors.
     #[test]
     fn merged_rankings_have_the_worst_pixels_of_one_complete_list() {
         let threads = Threads::new(Some(2)).expect("threads");

@@ -18,8 +18,9 @@ use super::tiles::{Grid, TILE};
 /// pixel missed at the bound would have the smallest alpha that is blended.
 const SLACK: f32 = 0.02;
 
-/// The tiles of a band that a splat covers: the number of the first tile, and a bit for each of the
-/// [`REACH_X`] × [`REACH_Y`] tiles to its right and below; or [`TOO_LARGE`](Self::TOO_LARGE).
+/// The tiles of a band (consecutive tiles whose lists are in memory) that a splat covers: the number of a tile, and a
+/// bit for each of the [`REACH_X`] × [`REACH_Y`] tiles from it to the right and down; or
+/// [`TOO_LARGE`](Self::TOO_LARGE).
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub(super) struct Footprint(pub(super) [u32; 2]);
 

@@ -111,7 +111,7 @@ impl MaskTask<'_> {
     ) {
         let masks = self.blocks.block(block);
         let MaskTerm { start, rate, threshold, .. } = self.term;
-        let least = logit(threshold);
+        let threshold = logit(threshold);
         for (lane, &age) in ages.iter().enumerate() {
             let at = |plane: usize| plane * WIDTH + lane;
             // Opacity and scales are multiplied by 1[σ(m) > threshold], whose derivative is approximated by that of
@@ -129,7 +129,7 @@ impl MaskTask<'_> {
             masks[at(OFFSET)] -= step;
             masks[at(FIRST)] = first;
             masks[at(SECOND)] = second;
-            if start + masks[at(OFFSET)] <= least {
+            if start + masks[at(OFFSET)] <= threshold {
                 params[at(plane::OPACITY)] = -LOGIT_MAX;
             }
         }

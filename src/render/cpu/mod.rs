@@ -111,12 +111,12 @@ pub struct CpuBackend {
     masks: Masks,
     signals: Accumulators,
     candidates: Candidates,
-    /// Pixels of the current view in which each row has the largest blend weight. Shape: `[budget]`, or empty if
-    /// they are not counted.
+    /// Number of pixels of the current view in which each row has the largest blend weight. Shape: `[budget]`, or empty
+    /// if they are not counted.
     dominant: Vec<AtomicU32>,
     /// Shape: `[budget]`.
     splats: Vec<Splat>,
-    /// One bit per lane of each block, set if the row is on screen in the current view. Shape: `[blocks]`.
+    /// One bit per row, set if it is on screen in the current view. Shape: `[blocks of sixteen rows]`.
     visible: Vec<u16>,
     lists: TileLists,
     /// Shape: `[tiles]`.
@@ -124,7 +124,7 @@ pub struct CpuBackend {
     /// Shape: `[tiles]`.
     gradient: Vec<TileGradient>,
     loss: LossBuffers,
-    /// One record per entry, up to the cap, as bits of f32. Shape: `[record cap, stride of the records]`.
+    /// One record per entry, a (row, tile) pair, up to the cap, as bits of f32. Shape: `[record cap, stride]`.
     records: Vec<AtomicU32>,
     record_cap: usize,
     /// The sum of each row's records. Between steps the memory is lent to the signals that a policy reads, for which

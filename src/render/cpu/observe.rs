@@ -182,7 +182,7 @@ struct Replay<'a> {
     /// The settings of the forward pass.
     blending: Blending,
     map: &'a Plane,
-    /// The records of this tile's entries; entries outside the current part have none.
+    /// The records of this tile's entries; only entries in the current [`Part`](super::records::Part) have one.
     records: TileRecords<'a>,
     /// Scratch.
     batch: &'a mut Batch,

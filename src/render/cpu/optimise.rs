@@ -37,7 +37,7 @@ pub(super) struct Optimise<'a> {
     /// Signal accumulators of these blocks; empty if there are none.
     pub(super) signals: &'a mut [f32],
     pub(super) planes: SignalPlanes,
-    /// Pixels in which each row has the largest weight; empty if they are not counted. Shape: `[rows]`.
+    /// Number of pixels in which each row has the largest weight; empty if they are not counted. Shape: `[rows]`.
     pub(super) dominant: &'a [AtomicU32],
     /// Shape: `[rows, layout.stride()]`.
     pub(super) sums: &'a [f32],
@@ -232,7 +232,7 @@ impl WithSimd for Differentiate<'_> {
         let sh_planes = out.sh.len() / out.means.len().max(1);
         let mut g = BlockGradient::ZERO;
         let mut scratch = Scratch::ZERO;
-        let trained = planes(view.sh_degree) - plane::SH;
+        let used_sh_planes = planes(view.sh_degree) - plane::SH;
         for b in 0..params.blocks {
             let block = params.open(b, planes(view.sh_degree), &mut scratch);
             let sums = &sums[b * per_block..(b + 1) * per_block];
@@ -245,7 +245,7 @@ impl WithSimd for Differentiate<'_> {
                 out.log_scales[row] = [0, 1, 2].map(|i| at(plane::LOG_SCALE + i));
                 out.quats[row] = [0, 1, 2, 3].map(|i| at(plane::QUAT + i));
                 out.opacity_logits[row] = at(plane::OPACITY);
-                for i in 0..trained {
+                for i in 0..used_sh_planes {
                     out.sh[row * sh_planes + i] = at(plane::SH + i);
                 }
                 out.mean2d[row] = g.mean2d.map(|line| line[lane]);

@@ -284,7 +284,7 @@ impl CpuBackend {
             let lists = &*lists;
             let tasks = points.par_iter_mut().zip(pixels);
             let point_of =
-                |(slot, &(x, y, error)): (&mut Option<Candidate>, &(usize, usize, f32))| {
+                |(point, &(x, y, error)): (&mut Option<Candidate>, &(usize, usize, f32))| {
                     if !is_in_band(x, y) {
                         return;
                     }
@@ -292,7 +292,7 @@ impl CpuBackend {
                     let list = lists.of_tile(tile(x, y) - band.start);
                     let surface = candidates::surface_row(splats, list, at, shortcuts, mode)
                         .and_then(|row| candidates::closest_approach(params, row, view, at));
-                    *slot = surface.map(|(position, depth)| Candidate {
+                    *point = surface.map(|(position, depth)| Candidate {
                         position: position.to_array(),
                         colour: colour(x, y),
                         pixel_size: depth / focal,

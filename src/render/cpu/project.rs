@@ -33,7 +33,7 @@ const FOV_MARGIN: f64 = 0.15;
 /// Rows with a larger colour are broken and are not rendered: added to a pixel, such a colour would leave no bits of
 /// precision for the other rows.
 const COLOUR_MAX: f32 = 1e6;
-/// √(½·log₂ e): the conic factors are scaled by it, so that exp(−p) becomes 2^(−u² − z²).
+/// √(½·log₂ e): the conic factors are scaled by it, so that exp(−½(u² + z²)) becomes 2^(−u² − z²).
 pub(crate) const EXPONENT_SCALE: f32 = 0.849_321_8;
 
 /// A camera in the form that the kernels use.

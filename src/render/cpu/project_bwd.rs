@@ -1,19 +1,19 @@
 //! Stage 6: from splat gradients to parameter gradients.
 //!
-//! The forward projection is evaluated again instead of stored. With the sums of stage 5 in
-//! whitened coordinates, M = Σ q·[u z]ᵀ[u z], the covariance's gradient is G = ½·L·M·Lᵀ. G is not
+//! The forward projection is evaluated again instead of stored. With the sums of stage 5 over pixels in
+//! whitened coordinates, M = Σ q·[u z]ᵀ[u z] with q = α·dL/dα, the covariance's gradient is G = ½·L·M·Lᵀ. G is not
 //! formed: for a needle 1,000 px long its entries cancel along the needle's axis. With
 //! W = Lᵀ·V, whose entries are at most 1, and wₖ its columns (one per axis of the Gaussian),
 //! - dL/d(log sₖ) = wₖᵀ·M·wₖ,
 //! - the gradient with respect to a rotation about local axis x is nᵧᵀ·M·n_z·(sᵧ² − s_z²), wₖ = sₖ·nₖ, and cyclically
-//!   for the others; it vanishes exactly for a sphere, and maps to the quaternion as 2/|q|·q̂⊗(0, g), which
-//!   is orthogonal to q,
+//!   for the others; this gradient g vanishes exactly for a sphere, and maps to the quaternion h as 2/|h|·ĥ⊗(0, g),
+//!   which is orthogonal to h,
 //! - dL/dV = L·M·W leads on to J and the mean.
 //!
 //! Derived from Σ = V·Vᵀ + κ·I, dL/dV = 2·G·V; checked against the float64 reference.
 //!
-//! Antialiasing adds the gradient through log ρ = ½ log det S − ½ log det Σ, S = V·Vᵀ, whose factor is q. It is
-//! q·(S⁻¹ − Σ⁻¹)·V with respect to V, and Σ⁻¹·V = ρ²·S⁻¹·V + κ·V/det Σ. With n = v₀ × v₁, n̂ = n/|n| and
+//! Antialiasing adds the gradient through log ρ = ½ log det S − ½ log det Σ, S = V·Vᵀ. With q now the sum of the pixels'
+//! q, it is q·(S⁻¹ − Σ⁻¹)·V with respect to V, and Σ⁻¹·V = ρ²·S⁻¹·V + κ·V/det Σ. With n = v₀ × v₁, n̂ = n/|n| and
 //! 1 − ρ² = κ·(tr S + κ)/det Σ, nothing cancels and nothing is divided by ρ:
 //! - dL/dV = q·(1 − ρ²)·[v₁ × n; n × v₀]/|n|² − q·κ·V/det Σ,
 //! - Vᵀ·S⁻¹·V = I − n̂·n̂ᵀ in the frame of the Gaussian's axes, for log-scales and rotations.
@@ -45,7 +45,7 @@ pub(super) struct BlockGradient {
     pub(super) sums: [[f32; WIDTH]; RecordLayout::MOST],
     /// 1 for visible rows, 0 for others.
     pub(super) visible: [f32; WIDTH],
-    /// Pixels in which the row has the largest blend weight, where they are counted.
+    /// Number of pixels in which the row has the largest blend weight, if they are counted.
     pub(super) dominant: [f32; WIDTH],
 }
 
@@ -131,15 +131,15 @@ impl BlockGradient {
         seen.keep(g.inv_z).store(&mut self.inv_z[at..]);
         // Projected mean: L·Σ q·(u, z).
         let dm = [l1 * qu, l3 * qz - l1 * shear * qu];
-        for (slot, x) in self.mean2d.iter_mut().zip(dm) {
-            seen.keep(x).store(&mut slot[at..]);
+        for (line, x) in self.mean2d.iter_mut().zip(dm) {
+            seen.keep(x).store(&mut line[at..]);
         }
         if layout.has(Field::AbsX) {
             // The sums hold Σ|q·u'| and Σ|q·(l3'·z' − l1'·shear·u')| with scaled u', z', l'.
             let abs =
                 [l1 * sum!(Field::AbsX.number()) * unscale, sum!(Field::AbsY.number()) * unscale2];
-            for (slot, x) in self.mean2d_abs.iter_mut().zip(abs) {
-                seen.keep(x).store(&mut slot[at..]);
+            for (line, x) in self.mean2d_abs.iter_mut().zip(abs) {
+                seen.keep(x).store(&mut line[at..]);
             }
         }
         // Columns of W without their scales, and their products with M.

@@ -1,6 +1,7 @@
 //! Stage 3: from tile lists to pixels. Front-to-back alpha blending (Kerbl et al. 2023, section 3 and
-//! appendix C): alpha = min(0.99, o·exp(−p)), skipped below 1/255. A pixel is finished before the first
-//! splat that would reduce its transmittance to 1e-4 or below. The thresholds 1/255 and 1e-4 can be set ([`Blending`]).
+//! appendix C): alpha = min(0.99, o·G), with o the opacity and G the projected Gaussian; a splat with alpha below 1/255
+//! is skipped. A pixel is finished before the first splat that would reduce its transmittance to 1e-4 or below. The
+//! thresholds 1/255 and 1e-4 can be set ([`Blending`]).
 //!
 //! A task renders one tile. It processes one batch of splats after another, and for each batch one patch of 4×4 pixels
 //! after another. A patch is a vector that stays in registers while the batch is blended into it. Most splats are a
@@ -188,7 +189,7 @@ impl Rasterize<'_> {
         let counts = self.depth_plane == DepthPlane::BlendedCount;
         let Self { splats, list, place, background, dominant, canvas, blending, batch, .. } = self;
         let c = |x: f32| V::splat(s, x);
-        let (faintest, t_min) = (c(-blending.log2_reach), c(blending.transmittance_min));
+        let (e_min, t_min) = (c(-blending.log2_reach), c(blending.transmittance_min));
         let (zero, never) = (V::zero(s), c(-1.0));
         let TileCanvas { planes, stop } = canvas;
         let [red, green, blue, finished, depth] = planes;
@@ -219,16 +220,16 @@ impl Rasterize<'_> {
                 let mut is_unfinished = false;
                 for at in (0..WIDTH).step_by(N * S::F32_LANES) {
                     let mut t = load_of::<S, N>(s, &transmittance[p][at..]);
-                    // Finished pixels must not be finished again.
-                    let mut least = t;
+                    // Pixels stop at this transmittance; finished ones must not be finished again.
+                    let mut stop_at = t;
                     for n in 0..N {
-                        least[n] = zero.lt(t[n]).select(t_min, never);
+                        stop_at[n] = zero.lt(t[n]).select(t_min, never);
                     }
                     let mut r = load_of::<S, N>(s, &red[p][at..]);
                     let mut g = load_of::<S, N>(s, &green[p][at..]);
                     let mut b = load_of::<S, N>(s, &blue[p][at..]);
                     let mut at_depth = load_of::<S, N>(s, &depth[p][at..]);
-                    let mut most = load_of::<S, N>(s, &largest.0[p][at..]);
+                    let mut w_max = load_of::<S, N>(s, &largest.0[p][at..]);
                     let mut todo = reached;
                     while todo != 0 {
                         // The mask has 32 bits; the remainder removes the bounds check of every load.
@@ -243,25 +244,25 @@ impl Rasterize<'_> {
                         let mut alpha = exp2_of(e);
                         let mut next = t;
                         for n in 0..N {
-                            alpha[n] = faintest.le(e[n]).keep(alpha[n].min(c(ALPHA_MAX)));
+                            alpha[n] = e_min.le(e[n]).keep(alpha[n].min(c(ALPHA_MAX)));
                             next[n] = alpha[n].neg_mul_add(t[n], t[n]);
                         }
-                        let mut some_stop = next[0].le(least[0]);
+                        let mut some_stop = next[0].le(stop_at[0]);
                         for n in 1..N {
-                            some_stop = some_stop.or(next[n].le(least[n]));
+                            some_stop = some_stop.or(next[n].le(stop_at[n]));
                         }
                         if some_stop.any() {
                             let here = s.splat_u32s(first + i as u32);
                             let mut all_stopped = true;
                             for n in 0..N {
-                                let stops = next[n].le(least[n]);
+                                let stops = next[n].le(stop_at[n]);
                                 let at = at + n * S::F32_LANES;
                                 let finished = &mut finished[p][at..];
                                 stops.select(t[n], V::load(s, finished)).store(finished);
                                 let stop = &mut S::as_mut_simd_u32s(&mut stop[p][at..]).0[0];
                                 *stop = stops.select_u32s(here, *stop);
                                 t[n] = stops.select(zero, t[n]);
-                                least[n] = stops.select(never, least[n]);
+                                stop_at[n] = stops.select(never, stop_at[n]);
                                 next[n] = alpha[n].neg_mul_add(t[n], t[n]);
                                 all_stopped &= !zero.lt(t[n]).any();
                             }
@@ -283,8 +284,8 @@ impl Rasterize<'_> {
                                 let here = s.splat_u32s(first + i as u32);
                                 let largest_at = &mut largest_at[p][at + n * S::F32_LANES..];
                                 let largest_at = &mut S::as_mut_simd_u32s(largest_at).0[0];
-                                *largest_at = most[n].lt(w).select_u32s(here, *largest_at);
-                                most[n] = most[n].max(w);
+                                *largest_at = w_max[n].lt(w).select_u32s(here, *largest_at);
+                                w_max[n] = w_max[n].max(w);
                             }
                         }
                         t = next;
@@ -295,7 +296,7 @@ impl Rasterize<'_> {
                     store_of(b, &mut blue[p][at..]);
                     if WITH_EXTRAS {
                         store_of(at_depth, &mut depth[p][at..]);
-                        store_of(most, &mut largest.0[p][at..]);
+                        store_of(w_max, &mut largest.0[p][at..]);
                     }
                     for t in t {
                         is_unfinished |= zero.lt(t).any();

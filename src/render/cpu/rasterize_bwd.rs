@@ -1,7 +1,7 @@
 //! Stage 5: from pixel gradients to splat gradients, one record per (row, tile) entry.
 //!
-//! Each tile's list is walked back to front. For pixel x and splat i with blend weight w = α·T,
-//! the derivative of Σ g·C is dL/dα = T·(c·g − b), where b is the gradient-weighted colour of
+//! Each tile's list is walked back to front. With g = dL/dC for a pixel's colour C, and for a splat of colour c and
+//! blend weight w = α·T, the derivative is dL/dα = T·(c·g − b), where b is the gradient-weighted colour of
 //! everything behind the splat, background included, normalised by the transmittance there. b is
 //! a running convex combination, b ← b + α(c·g − b): nothing is subtracted from a total, so that
 //! nothing cancels however little transmittance is left.
@@ -78,7 +78,7 @@ pub(super) struct RasterizeBwd<'a> {
     pub(super) canvas: &'a TileCanvas,
     pub(super) upstream: &'a TileGradient,
     pub(super) layout: RecordLayout,
-    /// The records of this tile's entries; entries outside the current part have none.
+    /// The records of this tile's entries; only entries in the current [`Part`](super::records::Part) have one.
     pub(super) records: TileRecords<'a>,
     /// Scratch.
     pub(super) batch: &'a mut Batch,
@@ -170,7 +170,7 @@ impl BlendedBatch {
         transmittance: &mut Plane,
     ) -> [usize; PATCHES] {
         let c = |x: f32| V::splat(s, x);
-        let faintest = c(-blending.log2_reach);
+        let e_min = c(-blending.log2_reach);
         let Self { alpha: alphas, weight: weights } = self;
         let mut ends = [0; PATCHES];
         let mut start = 0;
@@ -191,7 +191,7 @@ impl BlendedBatch {
                     let log2_opacity = c(batch.splats[i].log2_opacity);
                     let e = u.neg_mul_add(u, z.neg_mul_add(z, log2_opacity));
                     let here = s.splat_u32s((first + i) as u32);
-                    let seen = faintest.le(e).and(super::simd::before(s, here, stop));
+                    let seen = e_min.le(e).and(super::simd::before(s, here, stop));
                     let alpha = seen.keep(e.exp2().min(c(ALPHA_MAX)));
                     alpha.store(&mut alphas[pair % PAIRS][at..]);
                     (alpha * product).store(&mut weights[pair % PAIRS][at..]);

@@ -1,7 +1,7 @@
 //! The memory of the gradient records that the backward pass writes, one per (row, tile) entry, and their summation.
 //!
-//! If every entry of the lists has a record, it is stored in the entry's slot, so that the records of a row are
-//! adjacent. However, records take three quarters of all memory per entry (40 of 52 bytes) and are only needed until
+//! If every entry of the lists has a record, it is stored in the entry's [slot](super::tiles), so that the records of a
+//! row are adjacent. However, records take three quarters of all memory per entry (40 of 52 bytes) and are needed only until
 //! they are summed. If there are fewer records than entries, a band is processed in parts, each a run of tiles: its
 //! records are written in the order of the lists and added to the sums of their rows before the next part. A tile with
 //! more entries than there are records is processed once for each piece of its list. A row's records are always added
@@ -57,7 +57,7 @@ pub(super) struct Sums<'a> {
     pub(super) stride: usize,
     /// True if the sums start at 0.
     pub(super) fresh: bool,
-    /// Bit per lane of each block: whether the row has records. Shape: `[blocks]`.
+    /// One bit per row, set if the row has records. Shape: `[blocks of sixteen rows]`.
     pub(super) visible: &'a [u16],
 }
 

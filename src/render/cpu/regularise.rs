@@ -12,7 +12,7 @@ use super::simd::{V, WIDTH};
 use crate::StepInput;
 use densify_core::gaussians::sigmoid;
 
-/// The factors of the loss terms per row.
+/// The coefficients of the loss terms, divided by the number of values that each term averages.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Terms {
     /// Coefficient / rows.

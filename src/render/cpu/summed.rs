@@ -18,6 +18,7 @@ use crate::{StateError, StepInput, Tensor};
 /// The sums of the trainable rows.
 #[derive(Debug)]
 pub(super) struct GradientSums {
+    /// The longest intervals between steps that the policy has declared.
     longest: Cadence,
     /// First parameter plane that is summed.
     first: usize,

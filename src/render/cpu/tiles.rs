@@ -83,7 +83,7 @@ impl Entry {
 pub(super) struct Visible<'a> {
     /// Shape: `[rows]`.
     pub(super) splats: &'a [Splat],
-    /// Bit per lane of each block. Shape: `[blocks]`.
+    /// One bit per row, set if it is on screen. Shape: `[blocks of sixteen rows]`.
     pub(super) seen: &'a [u16],
 }
 
@@ -381,7 +381,7 @@ fn tiles_per_run(tiles: usize) -> usize {
 mod tests {
     use super::*;
 
-    /// Full-HD images that every Gaussian covers, with numbers of rows whose entries exceed 31 and 32 bits.
+    /// Full-HD images, each covered completely by every Gaussian; the numbers of entries exceed 31 and 32 bits.
     #[test]
     fn bands_are_cut_without_overflow() {
         const TILES: u64 = 120 * 68;
@@ -416,7 +416,7 @@ mod tests {
         }
     }
 
-    /// Fewer tiles than one run, whole runs, and a partial last run.
+    /// Numbers of tiles for less than one task, for whole tasks, and with a remainder.
     #[test]
     fn places_are_prefix_sums_over_tiles_and_chunks() {
         const RUN: usize = MIN_TILES_PER_RUN;

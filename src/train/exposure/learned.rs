@@ -1,6 +1,6 @@
 //! Exposures of the training views, learned together with the model.
 //!
-//! A brighter model with darker exposures gives the same images, so the mean over the views is held constant and only
+//! A brighter model with darker exposures gives the same images, so the views' mean exposure is held constant and only
 //! differences from it are learned. A weak regularisation towards the identity fixes what the photographs do not
 //! determine. Each view has its own Adam moments and takes a step when its photograph is trained on. The host computes
 //! these steps in a fixed order, so that runs are reproducible.
@@ -181,7 +181,8 @@ pub fn named_transforms<'a>(
 mod tests {
     use super::*;
 
-    fn mean(exposures: &Exposures) -> [f32; 2] {
+    /// The mean factor and offset of the green channel.
+    fn mean_green(exposures: &Exposures) -> [f32; 2] {
         let n = exposures.count() as f32;
         let all: Vec<_> = (0..exposures.count()).map(|view| exposures.transform(view)).collect();
         [
@@ -213,7 +214,7 @@ mod tests {
             let view = step % 2;
             let gradient = towards(&to[view], &exposures.transform(view));
             exposures.step(view, &gradient, f64::from(step as u32) / 400.0);
-            let [gain, offset] = mean(&exposures);
+            let [gain, offset] = mean_green(&exposures);
             assert!((gain - 1.0).abs() < 1e-6 && offset.abs() < 1e-6, "{gain}, {offset}");
         }
         for (view, to) in to.iter().enumerate() {

@@ -19,7 +19,7 @@ use serde::{Deserialize, Serialize};
 pub use best_fit::fitted;
 pub use learned::{Exposures, named_transforms};
 
-/// Whether exposures of the photographs are learned.
+/// The choice to learn exposures of the photographs or not.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, ValueEnum)]
 #[serde(rename_all = "kebab-case")]
 pub enum ExposureChoice {

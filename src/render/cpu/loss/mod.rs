@@ -43,7 +43,7 @@ const C2: f32 = 0.03 * 0.03;
 pub(crate) const SSIM_WEIGHT: f32 = 0.2;
 /// The constant subtracted from y.
 const MIDDLE: f32 = 0.5;
-/// Image rows per strip of whole tiles.
+/// Image rows per strip in passes that write whole tiles.
 const STRIP: usize = TILE;
 /// Image rows per strip in the other passes.
 const SHORT_STRIP: usize = TOGETHER;
@@ -451,12 +451,12 @@ struct Ssim<S: Simd> {
 impl<S: Simd> Ssim<S> {
     /// Computes SSIM and its derivatives from the means of e, y − ½, e² and (x − ½)·(y − ½).
     #[inline(always)]
-    fn new(s: S, [mu_e, middle, mean_ee, mean_xy]: [V<S>; 4]) -> Self {
+    fn new(s: S, [mu_e, shifted_y, mean_ee, mean_xy]: [V<S>; 4]) -> Self {
         let c = |x: f32| V::splat(s, x);
-        let mu_y = middle + MIDDLE;
+        let mu_y = shifted_y + MIDDLE;
         let mu_x = mu_e + mu_y;
         let var_e = (mean_ee - mu_e * mu_e).max(V::zero(s));
-        let cov = mean_xy - (middle + mu_e) * middle;
+        let cov = mean_xy - (shifted_y + mu_e) * shifted_y;
         let variances = (cov * 2.0 + var_e).max(V::zero(s));
         // One division for both inverses; the divisor is at least C₁·C₂ = 9e-8, far from underflow.
         let (a, b) = (mu_x * mu_x + mu_y * mu_y + C1, variances + C2);
@@ -466,7 +466,7 @@ impl<S: Simd> Ssim<S> {
         let contrast = c(1.0) - var_e * inv_b;
         let by_luminance = mu_e * inv_a * -2.0 * (c(1.0) - mu_e * mu_x * inv_a);
         let two_ve_bb = var_e * inv_b * inv_b * 2.0;
-        let by_contrast = mu_e * contrast * inv_b * 2.0 - middle * two_ve_bb;
+        let by_contrast = mu_e * contrast * inv_b * 2.0 - shifted_y * two_ve_bb;
         Self {
             ssim: luminance * contrast,
             by_mu_e: contrast * by_luminance + luminance * by_contrast,

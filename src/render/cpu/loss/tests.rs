@@ -5,7 +5,7 @@ use std::ops::Range;
 use super::super::tiles::Grid;
 use super::*;
 
-/// The scalars, dL/dpixel and each pixel's part of the loss for a structured rendering and target.
+/// The scalars, dL/dpixel and each pixel's error for a rendering and a target with different patterns.
 fn run(requests: ErrorRequests, mask: bool) -> (LossValue, Vec<f32>, Vec<f32>) {
     run_in(&mut LossBuffers::new(), [37, 50], requests, mask)
 }
@@ -44,7 +44,7 @@ fn run_in(
     (value, values(0..3), values(4..5))
 }
 
-/// Requested pixel errors change neither the loss nor its gradient.
+/// Also, requesting pixel errors changes neither the loss nor its gradient.
 #[test]
 fn the_mean_of_the_pixel_errors_is_the_loss() {
     for mask in [false, true] {

@@ -88,8 +88,8 @@ impl Segments {
             let segments = [segments(0), segments(1), segments(2), segments(3)];
             let segments = segments.map(|segment| segment.as_chunks::<RUN>().0);
             for (run, vectors) in line.as_chunks_mut::<RUN>().0.iter_mut().enumerate() {
-                let block = transposed(segments.map(|segment| segment[run]));
-                for (vector, part) in vectors.iter_mut().zip(block) {
+                let columns = transposed(segments.map(|segment| segment[run]));
+                for (vector, part) in vectors.iter_mut().zip(columns) {
                     vector[lane..lane + RUN].copy_from_slice(&part);
                 }
             }
@@ -105,8 +105,8 @@ impl Segments {
             for (run, vectors) in line.as_chunks::<RUN>().0.iter().enumerate() {
                 let part =
                     |i: usize| -> [f32; RUN] { std::array::from_fn(|l| vectors[i][lane + l]) };
-                let block = transposed([part(0), part(1), part(2), part(3)]);
-                for (l, part) in block.into_iter().enumerate() {
+                let columns = transposed([part(0), part(1), part(2), part(3)]);
+                for (l, part) in columns.into_iter().enumerate() {
                     pixels[(lane + l) * runs + run] = part;
                 }
             }
@@ -137,8 +137,8 @@ fn copy_vector(line: &mut [f32], from: usize, to: usize) {
     }
 }
 
-/// Transposes a block by means of `Mat4`, which uses vector instructions: the compiler turns a plain loop into one load
-/// and one store per number.
+/// Transposes a matrix by means of `Mat4`, which uses vector instructions; a plain loop would be compiled to one load and
+/// one store per number.
 #[inline(always)]
 fn transposed(rows: [[f32; RUN]; RUN]) -> [[f32; RUN]; RUN] {
     Mat4::from_cols_array_2d(&rows).transpose().to_cols_array_2d()

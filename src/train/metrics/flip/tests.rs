@@ -1,4 +1,4 @@
-//! Tests of FLIP against the authors' program, and of masks and blocks.
+//! Tests of FLIP against the authors' program, and of masks and the division into blocks of rows.
 
 use super::*;
 
