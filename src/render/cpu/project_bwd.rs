@@ -12,8 +12,8 @@
 //!
 //! Derived from Σ = V·Vᵀ + κ·I, dL/dV = 2·G·V; checked against the float64 reference.
 //!
-//! Antialiasing adds the gradient through log ρ = ½ log det S − ½ log det Σ, S = V·Vᵀ. With q now the sum of the pixels'
-//! q, it is q·(S⁻¹ − Σ⁻¹)·V with respect to V, and Σ⁻¹·V = ρ²·S⁻¹·V + κ·V/det Σ. With n = v₀ × v₁, n̂ = n/|n| and
+//! Antialiasing adds the gradient through log ρ = ½ log det S − ½ log det Σ, S = V·Vᵀ. With q now summed over the
+//! pixels, it is q·(S⁻¹ − Σ⁻¹)·V with respect to V, and Σ⁻¹·V = ρ²·S⁻¹·V + κ·V/det Σ. With n = v₀ × v₁, n̂ = n/|n| and
 //! 1 − ρ² = κ·(tr S + κ)/det Σ, nothing cancels and nothing is divided by ρ:
 //! - dL/dV = q·(1 − ρ²)·[v₁ × n; n × v₀]/|n|² − q·κ·V/det Σ,
 //! - Vᵀ·S⁻¹·V = I − n̂·n̂ᵀ in the frame of the Gaussian's axes, for log-scales and rotations.

@@ -1,8 +1,8 @@
 //! The memory of the gradient records that the backward pass writes, one per (row, tile) entry, and their summation.
 //!
 //! If every entry of the lists has a record, it is stored in the entry's [slot](super::tiles), so that the records of a
-//! row are adjacent. However, records take three quarters of all memory per entry (40 of 52 bytes) and are needed only until
-//! they are summed. If there are fewer records than entries, a band is processed in parts, each a run of tiles: its
+//! row are adjacent. However, records take three quarters of all memory per entry (40 of 52 bytes) and are needed only
+//! until they are summed. If there are fewer records than entries, a band is processed in parts, each a run of tiles:
 //! records are written in the order of the lists and added to the sums of their rows before the next part. A tile with
 //! more entries than there are records is processed once for each piece of its list. A row's records are always added
 //! in order of tile number, so that parts, like bands, cost time but do not change the result.

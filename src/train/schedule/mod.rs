@@ -20,12 +20,13 @@ use densify_render::LearningRates;
 pub use densify_policies::parameters::REFERENCE_ITERATIONS;
 
 /// Step sizes (learning rates) of a run. The step size of the means is a fraction of the scene's extent and falls
-/// log-linearly over the run; all others are constant unless their value at the end is given.
+/// log-linearly over the run. Apart from `fade` and `boost`, all others are constant unless their value at the end is
+/// given.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct RateOptions {
     /// Means at the start of the run `[fraction of the extent per step]`, ≥ 0. A step size that is 0 at the start is 0
-    /// in the whole run: its values are frozen.
+    /// in the whole run, so that its parameters do not change.
     pub mean_start: f64,
     /// Means at the end of the run `[fraction of the extent per step]`, > 0.
     pub mean_end: f64,
@@ -341,7 +342,7 @@ pub(crate) fn sample(values: &mut Vec<usize>, count: usize, rng: &mut ChaCha8Rng
     values.truncate(count);
 }
 
-/// What random numbers are used for. The streams for different purposes are independent.
+/// Purposes of random numbers. The streams for different purposes are independent.
 #[derive(Debug, Clone, Copy)]
 enum Purpose {
     Views = 1,

@@ -37,8 +37,8 @@ impl<V: ViewSource> Trainer<V> {
 
 /// Both sides times `scale`, rounded down. The scale is raised if the shorter side would be less than [`MIN_SIDE`].
 fn shrunk((width, height): (u32, u32), scale: f64) -> (u32, u32) {
-    let least = f64::from(MIN_SIDE) / f64::from(width.min(height));
-    let scale = scale.max(least).min(1.0);
+    let min_scale = f64::from(MIN_SIDE) / f64::from(width.min(height));
+    let scale = scale.max(min_scale).min(1.0);
     // The small addend compensates for the rounding of products that should be integers.
     let side = |side: u32| ((f64::from(side) * scale + 1e-6) as u32).max(1);
     (side(width), side(height))

@@ -137,8 +137,8 @@ fn copy_vector(line: &mut [f32], from: usize, to: usize) {
     }
 }
 
-/// Transposes a matrix by means of `Mat4`, which uses vector instructions; a plain loop would be compiled to one load and
-/// one store per number.
+/// Transposes a matrix by means of `Mat4`, which uses vector instructions; a plain loop would be compiled to one load
+/// and one store per number.
 #[inline(always)]
 fn transposed(rows: [[f32; RUN]; RUN]) -> [[f32; RUN]; RUN] {
     Mat4::from_cols_array_2d(&rows).transpose().to_cols_array_2d()

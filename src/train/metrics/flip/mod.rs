@@ -97,8 +97,8 @@ fn differences<T: Send>(
     })
 }
 
-/// Peak memory for a block of rows of this width `[bytes]`: eight `f64` planes that include the rows within the kernels'
-/// radius, seven of the block's own rows, and the [responses](PixelResponse) to both images.
+/// Peak memory for a block of rows of this width `[bytes]`: eight `f64` planes that include the rows within the
+/// kernels' radius, seven of the block's own rows, and the [responses](PixelResponse) to both images.
 pub(super) fn bytes_per_block(width: u64) -> u64 {
     let (rows, lines) = (BLOCK as u64, (BLOCK + 2 * Filters::new().radius()) as u64);
     let float = size_of::<f64>() as u64;

@@ -3,7 +3,7 @@
 use densify_policies::policy::Signal;
 
 use super::probe_views::mean;
-use super::{HIDDEN_LOGIT, MAX_TENTHS, Removal, allowed_loss, growth_signals, interval_steps};
+use super::{HIDDEN_LOGIT, MAX_TENTHS, Removal, allowed_fall, growth_signals, interval_steps};
 use crate::trainer::{AtStep, EditEvent, TrainError, Trainer};
 use densify_core::gaussians::ModelArray;
 use densify_core::pieces::pieces;
@@ -96,7 +96,7 @@ impl<V: ViewSource> Trainer<V> {
             }
             self.set_opacity_logits(step, &logits)?;
             let difference = mean(&self.probe_psnr(step, degree)?) - psnr;
-            let is_too_much = -difference >= allowed_loss(tenth);
+            let is_too_much = -difference >= allowed_fall(tenth);
             if !is_too_much || count == 0 {
                 change = difference;
             }

@@ -1,8 +1,8 @@
 //! The automatic budget: a limit on the number of rows that rises while more rows improve the images, and falls while
-//! rows can be removed without loss.
+//! rows can be removed at almost no cost in PSNR.
 //!
 //! The run is divided into intervals. At the end of each, before the policy's edit, the PSNR of a few training views
-//! (the probe views) is measured. In the first half of the run the limit then rises by half a doubling, up to the
+//! (the probe views) is measured. In the first half of the run the limit then rises by a factor of √2, up to the
 //! budget. Policies receive the limit as their budget, and plans enforce it, so policies need not know about it. The
 //! gain of a doubling is the slope of the PSNR over log2(rows), fitted to the last three intervals. Growth stops when
 //! the gain has been below [`MIN_GAIN`] twice in a row. The gain includes the improvement by training alone, so growth
@@ -15,7 +15,7 @@
 //! After growth, rows with low weights are pruned. At the end of each later interval the rows are sorted by their
 //! largest blend weight in any view. Tenths of them are hidden one after another and removed as long as the PSNR falls
 //! by less than [`MIN_GAIN`] per halving. The comparison uses the same model at the same step, so it has no noise. It
-//! overestimates the loss, because the remaining rows will adapt.
+//! overestimates the fall, because the remaining rows will adapt.
 //!
 //! Measuring does not change the model or any other state: rows are hidden only by their opacity logits, which are
 //! restored.
@@ -34,7 +34,7 @@ pub const MIN_GAIN: f64 = 0.10;
 /// Drop of the PSNR below the recent best beyond which the model counts as recovering from an edit `[dB]`. The probe
 /// views are always the same; with random views the noise would be larger than this.
 const MAX_DROP: f64 = 0.5;
-/// Number of intervals after which a loss counts as permanent. The insertions of `diet` take a sixth of a run, which is
+/// Number of intervals after which a drop counts as permanent. The insertions of `diet` take a sixth of a run, which is
 /// less than four intervals.
 const RECENT: usize = 6;
 /// Number of steps per interval in a run of 30,000 steps. Most policies stop growing halfway through the run: after ten
@@ -64,7 +64,7 @@ pub fn growth_signals() -> SignalSet {
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct AutoBudget {
-    /// Largest number of rows now.
+    /// Current limit on the number of rows.
     pub limit: usize,
     /// The step at which growth stopped, if it has.
     pub stopped: Option<u32>,
@@ -160,8 +160,8 @@ fn slope(intervals: &[Interval]) -> Option<f64> {
     is_enough.then(|| covariance / variance)
 }
 
-/// Loss of PSNR that is accepted for removing this many tenths of the rows `[dB]`.
-fn allowed_loss(tenths: usize) -> f64 {
+/// Fall of the PSNR that is accepted for removing this many tenths of the rows `[dB]`.
+fn allowed_fall(tenths: usize) -> f64 {
     MIN_GAIN * (10.0 / (10.0 - tenths as f64)).log2()
 }
 

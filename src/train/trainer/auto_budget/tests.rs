@@ -74,7 +74,7 @@ fn intervals_count_only_after_the_psnr_has_recovered() {
     let mut auto = AutoBudget::new(5_000, BUDGET);
     let settled: Vec<bool> = (1..).zip(psnr).map(|(end, psnr)| auto.record(end, 0, psnr)).collect();
     assert_eq!(settled, [true, true, true, true, true, false, false, true, true]);
-    // A loss that does not recover counts as permanent.
+    // A drop from which the PSNR does not recover counts as permanent.
     let mut auto = AutoBudget::new(5_000, BUDGET);
     let lost: Vec<bool> =
         (0..8).map(|end| auto.record(end, 0, if end == 0 { 30.0 } else { 20.0 })).collect();
