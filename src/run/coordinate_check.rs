@@ -146,10 +146,10 @@ fn correlation(
             xy += w * a * b;
         }
     }
-    let variance = |square: f64, mean: f64| square / sum - (mean / sum).powi(2);
+    let variance = |squares: f64, values: f64| squares / sum - (values / sum).powi(2);
     let (model_variance, truth_variance) = (variance(xx, x), variance(yy, y));
-    let least = CONTRAST * CONTRAST;
-    let varies = sum > 0.0 && model_variance > least && truth_variance > least;
+    let min_variance = CONTRAST * CONTRAST;
+    let varies = sum > 0.0 && model_variance > min_variance && truth_variance > min_variance;
     varies.then(|| (xy / sum - x / sum * (y / sum)) / (model_variance * truth_variance).sqrt())
 }
 

@@ -43,7 +43,7 @@ pub fn iteration(run: &Path, asked: Option<u32>) -> Result<u32, Failure> {
     }
 }
 
-/// As [`iteration`], for a run that may still be training; also returns true if it is training, and tells the observer.
+/// As [`iteration`], for a run that may still be training. If it is, tells the observer so and returns true.
 ///
 /// # Errors
 /// As [`iteration`].

@@ -26,7 +26,7 @@ const DEPTH_FACTOR: f64 = 0.5;
 pub struct NearPlane {
     /// Distance from the camera `[fraction of the extent]`.
     pub fraction: Fraction,
-    /// The user gave this plane.
+    /// True if the user gave this plane.
     is_given: bool,
     /// The share of what the views show that is nearer than this plane.
     hidden: f64,

@@ -127,7 +127,7 @@ pub enum ResumeProblem {
 #[derive(Debug, Clone, PartialEq)]
 #[expect(missing_docs, reason = "the fields are the data of the message of each variant")]
 pub enum TrainingProblem {
-    /// The model is invisible in most of the last views.
+    /// More than half of the last renderings are empty.
     DrawsNothing { empty: usize, views: usize },
     /// A signal stopped the run; `step` is `None` if nothing was written.
     Stopped { by: &'static str, step: Option<u32> },

@@ -89,7 +89,7 @@ pub enum ExposureSource {
     Given,
     /// The colours of tracks, before training.
     Tracks(ExposureSpread),
-    /// None: too few tracks are known, so exposures are not learned.
+    /// No evidence: too few tracks are known, so exposures are not learned.
     Undecided,
 }
 
@@ -102,7 +102,7 @@ pub enum DegreeSource {
     Given,
     /// The colours of tracks, before training.
     Spread(Spread),
-    /// None: too few tracks are known, so the degree is the highest.
+    /// No evidence: too few tracks are known, so the degree is the highest.
     Undecided,
 }
 

@@ -10,7 +10,7 @@ use densify_core::memory::Ledger;
 /// counted if they may be learned.
 ///
 /// # Errors
-/// As preparing the run.
+/// The errors of preparing the run.
 pub fn estimate(
     spec: &RunSpec,
     models: [Option<ModelSize>; 2],
@@ -23,7 +23,7 @@ pub fn estimate(
 /// Upper bound of the host memory of a run `[bytes]`.
 ///
 /// # Errors
-/// As preparing the run.
+/// The errors of preparing the run.
 pub fn host_bytes(spec: &RunSpec, host: Host<'_>) -> Result<u64, Failure> {
     let run = ResolvedRun::for_new_run(spec, host)?;
     Ok(run.case.ledger_of(&run.size)?.on_host())

@@ -38,7 +38,7 @@ pub struct Alternatives {
 /// Resolves a run without training or writing anything.
 ///
 /// # Errors
-/// As preparing the run.
+/// The errors of preparing the run.
 pub fn plan(spec: &RunSpec, host: Host<'_>) -> Result<Plan, Failure> {
     let ResolvedRun { case, size, mut reasons, .. } = ResolvedRun::for_new_run(spec, host)?;
     let ledger = case.ledger_of(&size)?;

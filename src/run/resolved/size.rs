@@ -195,17 +195,17 @@ impl ResolvedRun<'_> {
             return Ok(());
         }
         // Leave a 64th unused: the memory that the system grants varies from call to call.
-        let most = (now + left) / 64 * 63;
+        let allowed = (now + left) / 64 * 63;
         let on_host = |case: &Case<'_>| {
             let Some(Size { run_size, .. }) = solve(case)? else { return Ok(false) };
-            Ok::<_, Failure>(case.ledger_of(&run_size)?.on_host() <= most)
+            Ok::<_, Failure>(case.ledger_of(&run_size)?.on_host() <= allowed)
         };
         let mut base = case.spec.clone();
         // `--memory` is no remedy on a GPU: there it limits the device's memory.
         let lower_limit =
             (!is_resumed && case.inputs.device.kind() == BackendKind::Cpu).then(|| {
-                base.size.memory = Some(ByteCount(most / MIB * MIB));
-                Remedy::Memory(most / MIB)
+                base.size.memory = Some(ByteCount(allowed / MIB * MIB));
+                Remedy::Memory(allowed / MIB)
             });
         let mut fixes = if is_resumed {
             Vec::new()
@@ -303,7 +303,7 @@ fn no_size_error(case: &Case<'_>, request: &SizeRequest) -> Result<Failure, Fail
     let rows = case.min_rows().min(request.max_rows);
     let degree = *request.sh_degree.start();
     let memory = request.memory;
-    let Some(least) = min_memory(request, MIB, |size| bytes(case, size))? else {
+    let Some(needed) = min_memory(request, MIB, |size| bytes(case, size))? else {
         return Ok(SizeProblem::NoSize { memory }.into());
     };
     let mut fixes = remedies(case, case.spec, &Remedy::NEW_RUN, |case| Ok(solve(case)?.is_some()));
@@ -311,7 +311,7 @@ fn no_size_error(case: &Case<'_>, request: &SizeRequest) -> Result<Failure, Fail
     if let Some(fewer) = fit(&fewer, |size| bytes(case, size))? {
         fixes.push(vec![Remedy::Budget(fewer.size.rows)]);
     }
-    let needed = least / MIB;
+    let needed = needed / MIB;
     fixes.push(vec![Remedy::Memory(needed)]);
     Ok(SizeProblem::NoModelFits { memory, rows, sh_degree: degree, needed, remedies: fixes }.into())
 }

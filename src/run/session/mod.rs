@@ -234,7 +234,7 @@ impl<'a> Session<'a> {
         self.observer.checkpoint_written(step, trouble.as_deref());
     }
 
-    /// Fails if most of the last views were rendered empty, because such a model is useless.
+    /// Fails if more than half of the last renderings are empty, because such a model is useless.
     fn check_drawn(&self) -> Result<(), Failure> {
         let drawn = &self.totals.drawn;
         let (views, empty) = (drawn.len(), drawn.iter().filter(|drawn| !**drawn).count());

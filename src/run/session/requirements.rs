@@ -122,7 +122,7 @@ fn degree_left_out(config: &RunConfig) -> Option<LeftOut> {
                 "{} holds fewer rows at this degree than the scene starts with",
                 Spelling::Terminal.option("memory")
             ),
-            loss: "its loss was not measured".to_owned(),
+            loss: "the cost in quality was not measured".to_owned(),
         });
     }
     // Any other degree below the highest was set by an option.
@@ -149,7 +149,7 @@ fn exposures_left_out(config: &RunConfig) -> Option<LeftOut> {
             "judged by the colours of {} points, the exposures of {} views differ by {:.2} stops (rms)",
             spread.tracks, spread.views, spread.stops
         ),
-        loss: "its loss was not measured".to_owned(),
+        loss: "the cost in quality was not measured".to_owned(),
     })
 }
 
@@ -186,7 +186,7 @@ fn unscored(views: usize) -> LeftOut {
         what: format!("{views} training views from the policy's scores"),
         evidence: "each has a near-duplicate within 1 % of the scene's extent and one degree"
             .into(),
-        loss: "its loss was not measured".into(),
+        loss: "the cost in quality was not measured".into(),
     }
 }
 

@@ -32,7 +32,7 @@ pub struct Run {
     pub(super) test: DatasetViews,
     /// The dataset, with at most as many points as the companion (such as the page of `--view`) asks for.
     pub dataset: Dataset,
-    /// The bytes of every buffer; the run takes no more than their sum.
+    /// The bytes of every buffer; the run takes no more than their [total](Ledger::total).
     pub ledger: Ledger,
     /// The measurement against the known surface at the end, if there is such a surface.
     pub(super) geometry_measurement: Option<GeometryMeasurement>,

@@ -136,7 +136,7 @@ impl Partial {
         self.0.iter().map(|(name, value)| (&**name, value))
     }
 
-    /// True if a file with this table has the same options and values.
+    /// True if `table` has exactly these options and values.
     pub fn is_table(&self, table: &Table) -> bool {
         self.0 == *table
     }

@@ -141,10 +141,10 @@ pub(super) fn min_memory<E>(
     };
     // The smallest model with all of its images.
     let all = SizeRequest { memory: u64::MAX, ..request.clone() };
-    let least = request.min_rows.clamp(1, request.max_rows.max(1));
-    let most = bytes(&all.size(least, *request.sh_degree.start(), request.pairs[0]))?;
-    let Ok(most) = usize::try_from(most.div_ceil(step)) else { return Ok(None) };
-    let insufficient = largest_where(0, most, |steps| Ok(!fits(steps, &mut bytes)?))?;
+    let rows = request.min_rows.clamp(1, request.max_rows.max(1));
+    let enough = bytes(&all.size(rows, *request.sh_degree.start(), request.pairs[0]))?;
+    let Ok(max_steps) = usize::try_from(enough.div_ceil(step)) else { return Ok(None) };
+    let insufficient = largest_where(0, max_steps, |steps| Ok(!fits(steps, &mut bytes)?))?;
     Ok(Some(insufficient.map_or(0, |steps| steps as u64 + 1) * step))
 }
 

@@ -20,7 +20,7 @@ pub use table::KNOBS;
 /// A setting that trades speed or memory for accuracy.
 #[derive(Debug)]
 pub struct Knob {
-    /// Such as `alpha_min`.
+    /// Name, such as `alpha_min`.
     pub name: &'static str,
     /// Its value if none is set.
     pub default: &'static str,
@@ -57,7 +57,7 @@ pub enum Domain {
 /// The worst effect of a knob on the result.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Class {
-    /// None: the same bits.
+    /// No effect: the result has the same bits.
     Exact,
     /// A bounded numerical error: the same model looks slightly different.
     Bounded,

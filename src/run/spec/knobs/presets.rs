@@ -8,7 +8,7 @@ use super::KnobError;
 /// Knobs and options that are set together.
 #[derive(Debug)]
 pub struct Preset {
-    /// Such as `fast`.
+    /// Name, such as `fast`.
     pub name: &'static str,
     /// What the preset promises, in one line.
     pub promise: &'static str,
