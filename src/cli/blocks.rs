@@ -69,7 +69,7 @@ struct PlanArgs {
     /// least 1,000]`
     #[arg(long, value_name = "N")]
     coarse_rows: Option<Rows>,
-    /// Width of the margin around its cell in which a block also trains, as a share of the usual width of a cell
+    /// Width of the margin around a cell in which its block also trains, as a share of the usual width of a cell
     #[arg(long, value_name = "FRACTION", default_value = "0.1")]
     margin: Fraction,
     /// Options of `densify train` for every run, after `--`; --iterations is the length of one run over the whole

@@ -165,9 +165,9 @@ fn format_table(geometry: &Geometry) -> String {
         ("floaters, share of Gaussians".to_owned(), percent(floaters.of_rows)),
         ("floaters, share of weight".to_owned(), percent(floaters.of_weight)),
     ];
-    for width in thin {
-        let name = format!("thin structures found, {} px wide", width.width);
-        lines.push((name, percent(width.recall)));
+    for structures in thin {
+        let name = format!("thin structures found, {} px wide", structures.width);
+        lines.push((name, percent(structures.recall)));
     }
     lines.push(("Gaussians blended per pixel".to_owned(), plain(redundancy.blended_per_pixel, "")));
     lines.push((

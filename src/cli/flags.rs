@@ -33,7 +33,7 @@ pub(super) fn given(matches: &ArgMatches, spec: &RunSpec) -> Result<Partial, Fai
     Partial::given(spec, |name| matches.value_source(name) == Some(ValueSource::CommandLine))
 }
 
-/// Parses the options of `densify train` that follow another `command`; the scene is not among them.
+/// Parses options of `densify train` after the `--` of another `command`; the scene is not among them.
 pub(super) fn parse_words(words: &[String], command: &'static str) -> Result<Partial, Failure> {
     let command = Command::new(command).no_binary_name(true).disable_help_flag(true);
     let command = with_defaults(RunSpec::augment_args(command));

@@ -26,7 +26,7 @@ def check(browser: Browser, url: str, run: Path, folder: Path | None) -> None:
     browser.size(1280, 800)
     browser.open(url)
     browser.wait_until_sharp()
-    browser.press("\ue007")
+    browser.press("\ue007")  # Enter closes the help
     # Curves, edits and the picture are updated during training.
     browser.wait_for(f"Number({STATE}.step) > 300", "training does not proceed")
     for curve in ("psnr", "loss", "rows"):

@@ -21,7 +21,7 @@ def measure(browser: Browser, url: str, rounds: int) -> None:
     browser.size(640, 480)
     browser.open(url)
     browser.wait_until_sharp()
-    browser.press("\ue007")
+    browser.press("\ue007")  # Enter closes the help
     browser.run("document.getElementById('fold').click(); goHome(); leaveView(); changed();")
     browser.wait_until_sharp()
     rows = browser.run("return scene.models[0].rows")

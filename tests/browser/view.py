@@ -124,7 +124,8 @@ const [milliseconds, took, knownLatency] = arguments;
 pace([{ bitmap: { width: 1, height: 1 }, bytes: 1000, milliseconds, held: milliseconds, took }], performance.now() - took, true, 0.5);
 return coarse;
 """
-# Delays every reply by a number of milliseconds, like a slow network; also records the most requests under way at once.
+# Delays every reply by a number of milliseconds, like a slow network; also records the largest number of requests under
+# way at once.
 DELAY = """
 const undelayed = window.fetch;
 window.fetch = async (...request) => {
@@ -433,7 +434,7 @@ def check(browser: Browser, url: str, densify: str, run: str, rendered: Path, fo
     browser.run("document.getElementById('marks').focus()")
     browser.press("k", "r", "]", "k")
     assert not browser.run("return document.getElementById('save').disabled"), "there is no camera path to save"
-    assert browser.run("return keys.length") == 2
+    assert browser.run("return keyframes.length") == 2
     # densify renders the camera path that the page saves.
     keep = "URL.createObjectURL = (blob) => { window.made = blob; return 'data:,'; };"
     keep += "HTMLAnchorElement.prototype.click = function () { if (this.download) made.text().then((it) => { window.saved = it; }); };"
@@ -456,7 +457,7 @@ def check(browser: Browser, url: str, densify: str, run: str, rendered: Path, fo
     psnr = browser.run_async(PSNR.replace("shown[1]", "shown[0]"), f"data:image/png;base64,{png}")
     assert psnr >= 36, f"half-way along the path, the page has a PSNR of {psnr:.1f} dB to densify"
     browser.run("document.getElementById('remove').click()")
-    assert browser.run("return keys.length") == 1, "the last camera is not removed"
+    assert browser.run("return keyframes.length") == 1, "the last camera is not removed"
 
     # A narrow screen.
     browser.size(360, 740)
@@ -534,7 +535,7 @@ def check_two_runs(browser: Browser, url: str, folder: Path | None) -> None:
     browser.open(url)
     browser.wait_until_sharp()
     if browser.run("return document.getElementById('guide').open"):
-        browser.press("\ue007")
+        browser.press("\ue007")  # Enter
     names = browser.run("return scene.models.map(({ name }) => name)")
     tags = browser.run("return ['left-name', 'right-name'].map((id) => document.getElementById(id).textContent)")
     assert len(names) == 2 and all(name in tag for name, tag in zip(names, tags)), f"{names}: {tags}"

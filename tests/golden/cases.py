@@ -24,7 +24,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Intended:
-    """An intended difference in files of some cases, both given as shell patterns."""
+    """An intended difference. Shell patterns give the cases and their files."""
 
     cases: str
     files: str
@@ -95,7 +95,7 @@ def small(more: str = "", preset: str = "spheres", size: int = 48, points: int =
 
 
 def run(output: str, more: str = "", budget: str = "1k", iterations: int = 60, backend: str = "native") -> str:
-    """The command that trains on that scene."""
+    """The command that trains on the scene of `small`."""
     return (f"train scene -o {output} {BACKENDS[backend]} -b {budget} --seed 0 --iterations {iterations} "
             f"--checkpoint-every 20 --eval {more}")
 

@@ -46,7 +46,7 @@ def bounds(found: list[Row]) -> list[float]:
 
 
 def compare(truth: list[Row], found: list[Row], label: str) -> None:
-    """Allows for the precision of the coarsest format, and for its palette of coefficients."""
+    """Checks that both have the same rows, to the precision of the coarsest format and its palette of coefficients."""
     assert len(truth) == len(found), f"{label}: {len(found)} rows"
     distance = max(abs(a - b) for a, b in zip(bounds(truth), bounds(found)))
     assert distance < 0.003, f"{label}: the bounds differ by {distance}"

@@ -48,7 +48,7 @@ fn small_gaussians_are_rendered_with_the_stated_antialiasing() {
     let mip = "comment SplatRenderMode: mip\n";
     let brush = format!("comment Exported from Brush\n{mip}");
     // A 3D filter as wide as the Gaussian doubles its variances and multiplies its opacity by 2^(−3/2). At a
-    // projected variance of 0.08 px², the kernel of 0.1 px² then multiplies it by 0.08 / 0.18.
+    // projected variance of 0.08 px², the kernel of 0.1 px² then multiplies the opacity by 0.08 / 0.18.
     let filter = [("filter_3D", 0.02)];
     let filtered = 0.9 * 0.5_f32.powf(1.5) * 255.0 * (0.08 / 0.18);
     for (comments, more, stated, grey) in [

@@ -1,4 +1,4 @@
-//! Candidates: the places where each error mode finds them, places without candidates, and agreement of all backends.
+//! Candidates for new Gaussians: where each error mode finds them, where there must be none, and agreement of backends.
 
 use densify::core::camera::Camera;
 use densify::core::gaussians::{Gaussians, logit, rgb_to_dc};

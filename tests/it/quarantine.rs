@@ -95,7 +95,7 @@ fn non_finite_rows_do_not_affect_others() {
     };
     on_each(repeatable(), |subject| {
         let without = train(&mut *make(subject, &remove(&model, POISONED)));
-        // One number of each class.
+        // One parameter of each class, and one of a higher SH band.
         for slot in [1, 4, 8, 10, 12, 40] {
             let mut poisoned = model.clone();
             *slot_mut(&mut poisoned, POISONED, slot) = f32::NAN;

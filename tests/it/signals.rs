@@ -67,8 +67,8 @@ fn rendering_and_loss(model: &Model, view: View<'_>, target: &Image8) -> (Image,
     (image, loss)
 }
 
-/// For one view by the reference: the gradient of the training loss, the weighted error of each row, and the share of
-/// pixels that each row dominates.
+/// The reference's results for one view: the gradient of the training loss, the weighted error of each row, and the
+/// share of pixels that each row dominates.
 pub(crate) fn reference(
     model: &Gaussians,
     view: View<'_>,

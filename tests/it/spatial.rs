@@ -29,7 +29,7 @@ use crate::subject::{make_with, normalised, on_each, repeatable};
 
 /// The step of the event.
 const STEP: u32 = 3;
-/// Displacement of rows outside the box.
+/// Displacement along x of the rows that are not split.
 const SHIFT: f32 = 0.25;
 /// Offspring half a standard deviation to either side along the second axis.
 const HALVES: Placement = Placement::Axes([0.0, 0.5, 0.0]);
@@ -38,7 +38,7 @@ const HALVED: ScaleRule = ScaleRule::Axes([1.0, 0.5, 1.0]);
 /// A quarter turn about the first axis.
 const QUARTER: [f32; 4] = [1.0, 1.0, 0.0, 0.0];
 
-/// Rows in the box x > `left` are split in two; the others move along x and are tinted by their mean error.
+/// Rows with x > `left` are split in two; the others move along x and are tinted by their mean error.
 #[derive(Clone, Copy, Default, serde::Serialize, serde::Deserialize)]
 #[serde(deny_unknown_fields, default)]
 struct Spatial {

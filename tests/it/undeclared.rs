@@ -40,9 +40,9 @@ fn undeclared_features_need_no_memory() {
     };
     let all = devices().iter().map(|device| ("GPU", Some(device)));
     for (name, device) in iter::once(("native", None)).chain(all) {
-        let least = promise(device, &none());
+        let undeclared = promise(device, &none());
         for needs in &declared {
-            assert!(promise(device, needs) > least, "{name}: {needs:?}");
+            assert!(promise(device, needs) > undeclared, "{name}: {needs:?}");
         }
         let error = promise(device, &needs(&[Signal::ErrorScore]));
         assert!(promise(device, &with_edges) > error, "{name}: edges");
@@ -53,6 +53,6 @@ fn undeclared_features_need_no_memory() {
             error_score: edges,
             ..none()
         };
-        assert_eq!(promise(device, &free), least, "{name}: {free:?} needs memory");
+        assert_eq!(promise(device, &free), undeclared, "{name}: {free:?} needs memory");
     }
 }

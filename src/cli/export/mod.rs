@@ -23,7 +23,7 @@ use table::WrittenFile;
 /// Value of `--format` that selects every format.
 const ALL: &str = "all";
 
-/// Writes a trained model in another format, or in all.
+/// Writes a trained model in another format, or in all formats.
 ///
 /// The model keeps the coordinates of the dataset. A file appears only when it is complete. With
 /// --format all, or --scene, prints the size of each file; with --scene, also reads each file back and prints
@@ -172,7 +172,7 @@ fn output_files(args: &ExportArgs) -> Result<Vec<(&'static Format, PathBuf)>, Fa
     }
 }
 
-/// The name of a model's files: that of its run, or of its file without the extension.
+/// The name of the written files without extension: that of the run, or of the model's file.
 fn output_stem(model: &Path) -> String {
     let name = model.file_name().unwrap_or("model".as_ref()).to_string_lossy().into_owned();
     if model.is_dir() {
@@ -192,7 +192,7 @@ pub(super) fn format_from_extension(output: &Path) -> Result<&'static Format, Fa
         .map_err(|error| Failure::input(format!("-o: {error}, and name it with --format NAME")))
 }
 
-/// Fails if the output would replace something that it must not.
+/// Fails if the output is a folder, a device or a pipe; without `overwrite`, also if it is a file.
 pub(super) fn check_output(path: &Path, overwrite: bool) -> Result<(), Failure> {
     let shown = path.display();
     match path.symlink_metadata() {

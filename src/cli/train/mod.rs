@@ -46,7 +46,7 @@ pub(super) struct TrainArgs {
     /// Show the run in the browser while it trains: serves a page on this machine alone, with the model,
     /// curves and edits, and buttons that pause, save and stop the run (default port: the first free one from 8080
     /// on). From another machine: ssh -L 8080:127.0.0.1:8080 NAME, then open the whole printed address. The page's
-    /// pictures are no larger than the largest photograph. The page does not change the run, but takes part of --memory
+    /// pictures are no larger than the largest photograph. The page does not change the run, but uses part of --memory
     #[arg(
         long, value_name = "PORT", num_args = 0..=1, require_equals = true, default_missing_value = "0",
         help_heading = "Output"

@@ -129,13 +129,13 @@ fn a_failed_checkpoint_does_not_harm_the_run() {
     let expected = case.model();
     assert_eq!(case.checkpoints(), ["12", "8"]);
     for operation in OPERATIONS {
-        for (kind, step, left) in [
+        for (kind, file, left) in [
             (ErrorKind::StorageFull, "iteration_8.safetensors", ["12", "4"]),
             (ErrorKind::Other, "iteration_12.safetensors", ["4", "8"]),
         ] {
             case.remove_run();
             assert_eq!(
-                case.train_with_fault(operation, step, 0, kind),
+                case.train_with_fault(operation, file, 0, kind),
                 (0, String::new()),
                 "{operation:?}"
             );
@@ -167,7 +167,8 @@ fn a_run_stopped_by_the_disk_can_be_resumed() {
         (&OPERATIONS, "results.json", 0, &["4", "8"]),
         (&OPERATIONS, "stats/summary.json", 0, &["12", "8"]),
         (&[Operation::Write], "stats/train.jsonl", 0, &["4", "8"]),
-        // The first write is the header; the others are the records of step 10 and the scores of step 12.
+        // The TensorBoard file: its first write is the header; the others are the record of step 10 and the scores of
+        // step 12.
         (&[Operation::Write], ".densify", 1, &["4", "8"]),
         (&[Operation::Write], ".densify", 2, &["4", "8"]),
     ];
@@ -256,6 +257,7 @@ fn short_writes_are_continued() {
     let expected = case.model();
     let events = std::fs::read(case.run().join("stats/events.jsonl")).unwrap();
     case.remove_run();
+    // Without a fault, `with_fault` makes every write accept a single byte.
     with_fault(None, || case.train("")).0.unwrap();
     assert!(case.model() == expected);
     assert!(std::fs::read(case.run().join("stats/events.jsonl")).unwrap() == events);

@@ -1,10 +1,10 @@
 //! Trains a large scene in blocks and merges their models. A plan describes the runs and their memory.
 //!
 //! The ground is divided into cells of equal work (`cells.rs`). A coarse run trains the whole scene. Each block is then
-//! a run of its own: it trains on the views that see its cell (`visibility.rs`), starts from the coarse Gaussians in
-//! and around the cell, and renders the other visible Gaussians as frozen (`task.rs`). Its Gaussians within the cell
-//! become its part of the merged model (`merge.rs`). Every block has a share of the budget, so the merged model stays
-//! within the budget. `densify_launch` starts the tasks. Prints nothing.
+//! a run of its own: it trains on the views that see its cell or its margin (`visibility.rs`), starts from the coarse
+//! Gaussians in and around the cell, and renders the other visible Gaussians as frozen (`task.rs`). Its Gaussians
+//! within the cell become its part of the merged model (`merge.rs`). Every block has a share of the budget, so the
+//! merged model stays within the budget. `densify_launch` starts the tasks. Prints nothing.
 
 mod cells;
 mod ground;
@@ -35,11 +35,11 @@ pub use status::{TaskState, status};
 pub use submit::submit;
 pub use task::run;
 
-/// Largest accepted plan `[bytes]`; a block takes 0.4 kB.
-const MAX_PLAN: u64 = 256 << 20;
+/// Largest accepted plan `[bytes]`; a block takes 0.3 kB.
+const MAX_PLAN_BYTES: u64 = 256 << 20;
 /// File name of the plan.
 pub const PLAN_FILE: &str = "plan.toml";
-/// File names of the options of the coarse run and of a block's run: the user's and those that the plan sets.
+/// Names of the files with the options of the coarse run and of a block's run, both the user's and the plan's own.
 const COARSE_FILE: &str = "coarse.toml";
 const BLOCK_FILE: &str = "block.toml";
 /// Default file name of the merged model.
@@ -75,7 +75,7 @@ pub struct BlockPlan {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Coarse {
-    /// Budget.
+    /// Maximum number of Gaussians.
     pub rows: usize,
     /// Number of iterations.
     pub iterations: u32,
@@ -93,7 +93,7 @@ pub struct Block {
     pub rows: usize,
     /// Budget in training, margin included and frozen rows excluded; the merge drops the Gaussians in the margin.
     pub budget: usize,
-    /// Number of training views that see its cell.
+    /// Number of training views that see its cell or margin.
     pub views: usize,
     /// Number of iterations.
     pub iterations: u32,
@@ -123,7 +123,7 @@ impl BlockPlan {
     /// If the file is missing or malformed.
     pub fn read(folder: &Path) -> Result<Self, Failure> {
         let path = folder.join(PLAN_FILE);
-        let text = files::read_text(&path, MAX_PLAN).map_err(|error| {
+        let text = files::read_text(&path, MAX_PLAN_BYTES).map_err(|error| {
             let remedy = "name a folder that `densify blocks plan` wrote";
             Failure::input(format!("{}: {error}; {remedy}", path.display()))
         })?;

@@ -11,7 +11,7 @@ pub(super) const MAX_GRID: usize = 1000;
 /// The number of blocks.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Grid {
-    /// As few as fit in the memory of a task.
+    /// The fewest blocks whose tasks fit in the memory limit.
     Auto,
     /// Number of strips along the longer side of the scene's ground, and number of blocks per strip.
     Fixed([usize; 2]),

@@ -39,7 +39,7 @@ pub fn run(
     threads: Option<u32>,
     observer: &dyn Observer,
 ) -> Result<(), Failure> {
-    // Blocks may have changed since the last merge.
+    // A complete merge is repeated, because blocks may have changed since.
     if task != Task::Merge && is_complete(folder, plan, task) {
         observer.say(format_args!("{} is complete", plan.name(task)));
         return Ok(());

@@ -11,7 +11,7 @@ use densify_run::failure::Failure;
 
 /// Minimum number of tracks; fewer are not representative.
 const MIN_TRACKS: usize = 500;
-/// A view belongs to a block if at least this fraction of the points that it sees lie in the block.
+/// A view belongs to a block if at least this fraction of the points that it sees lie in the block's cell or margin.
 const MIN_FRACTION: f64 = 0.05;
 /// Margin around a block's points in the part of an image that the block trains on, as a fraction of the image's size.
 const PART_MARGIN: f64 = 0.04;
@@ -194,14 +194,14 @@ mod tests {
             on_ground: vec![[0.0; 2], [0.0; 2], [9.0; 2]],
             seen_by: vec![vec![0], vec![0, 1], vec![0, 1]],
         };
-        let near = |part: Option<Part>, expected: [f64; 4]| {
+        let assert_part = |part: Option<Part>, expected: [f64; 4]| {
             let Part { left, top, right, bottom } = part.expect("it is seen");
             let is_near = |(a, b): (f64, f64)| (a - b).abs() < 1e-9;
             assert!([left, top, right, bottom].into_iter().zip(expected).all(is_near), "{part:?}");
         };
         let seen = visibility.coverage(&dataset.train, |[x, _]| x < 1.0);
-        near(seen[0].part, [0.26, 0.46, 0.54, 0.54]);
-        near(seen[1].part, [0.46, 0.46, 0.54, 0.54]);
+        assert_part(seen[0].part, [0.26, 0.46, 0.54, 0.54]);
+        assert_part(seen[1].part, [0.46, 0.46, 0.54, 0.54]);
         assert_eq!([seen[0].inside, seen[0].all, seen[1].inside, seen[1].all], [2, 3, 1, 2]);
         let none = visibility.coverage(&dataset.train, |_| false);
         assert_eq!([none[0].part, none[1].part], [None, None]);

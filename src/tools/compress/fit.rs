@@ -127,7 +127,7 @@ pub(super) fn packings(options: &Options<'_>, model: &Gaussians) -> Result<Vec<P
     let Some((format, rows)) = best else { return Ok(Vec::new()) };
     let packing = Packing { format, rows, is_whole: rows == model.len() };
     let variants = format.variants();
-    // Variants differ only in the bands above 0.
+    // Variants differ only in the accuracy of SH bands above 0.
     let (Target::Bytes(limit), [most_accurate, ..], 1..) = (options.to, variants, model.sh_degree)
     else {
         return Ok(vec![packing]);
@@ -150,7 +150,7 @@ pub(super) fn packings(options: &Options<'_>, model: &Gaussians) -> Result<Vec<P
     Ok(packings)
 }
 
-/// Estimates with how many rows of this model the file meets the target; [`trim`] drops any that are too many. `None`
+/// Estimates the number of rows of this model whose file meets the target; [`trim`] drops any excess. `None`
 /// if not even one row fits.
 pub(super) fn rows_that_fit(
     to: Target,
@@ -223,8 +223,8 @@ fn smallest_size(options: &Options<'_>, model: &Gaussians) -> (u64, &'static str
 
 /// The failure if not even one Gaussian fits.
 pub(super) fn too_small(options: &Options<'_>, model: &Gaussians) -> Failure {
-    let (least, format) = smallest_size(options, model);
+    let (bytes, format) = smallest_size(options, model);
     Failure::input(format!(
-        "--to: no model fits; one Gaussian takes {least} bytes as {format}; give a larger size"
+        "--to: no model fits; one Gaussian takes {bytes} bytes as {format}; give a larger size"
     ))
 }

@@ -96,7 +96,7 @@ pub struct Attempt {
 pub struct Compressed {
     /// Measurements of the original model, with the size that it has as a PLY.
     pub whole: Attempt,
-    /// Measurements of the best attempt after each stage of its training but the last.
+    /// Measurements of the best attempt after each intermediate stage: a pruning and the training that follows.
     pub stages: Vec<Attempt>,
     /// All attempts in order.
     pub attempts: Vec<Attempt>,
@@ -220,7 +220,7 @@ impl Search<'_> {
         Ok(Some((attempt, small)))
     }
 
-    /// Writes a model in a format, reads it back and evaluates it, so that the losses of the format count.
+    /// Writes a model in a format, reads it back and evaluates it, so that the format's rounding counts.
     fn evaluate_file(
         &self,
         model: &Gaussians,

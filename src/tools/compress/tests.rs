@@ -128,12 +128,12 @@ fn colours_stay_as_decoded_from_the_file() {
     let tuned =
         tune::tune(start.clone(), (variant, 256), &options, &scratch, &Silent, &mut |_| Ok(()));
     let tuned = tuned.expect("it trains");
-    let palette = |model: &Gaussians| {
+    let palette_size = |model: &Gaussians| {
         let bands = model.sh.chunks_exact(3 * sh_coefficients(3)).map(|row| &row[3..]);
         let text = |row: &[f32]| format!("{row:.6?}").replace("-0.000000", "0.000000");
         bands.map(text).collect::<HashSet<_>>().len()
     };
-    assert_eq!((tuned.len(), palette(&start)), (256, 256));
-    assert!(palette(&tuned) <= 256 / 4, "{} entries", palette(&tuned));
+    assert_eq!((tuned.len(), palette_size(&start)), (256, 256));
+    assert!(palette_size(&tuned) <= 256 / 4, "{} entries", palette_size(&tuned));
     assert_ne!(tuned.opacity_logits, [0.0; 256], "the rest is trained");
 }

@@ -42,7 +42,7 @@ pub(super) fn tune(
             after_stage(&model)?;
         }
         if stage > 0 && stage + 1 == stages.len() {
-            model = reduce(model, u8::MAX);
+            model = reduce(model, u8::MAX); // Keeps the degree.
             budget = fit::rows_that_fit(options.to, format, &model)?.unwrap_or(1);
         }
         observer.say(format_args!(
@@ -57,7 +57,7 @@ pub(super) fn tune(
         let setting = (budget, iterations - adaptation_steps);
         model = train(model, setting, false, options, scratch, observer)?;
         if adaptation_steps > 0 {
-            model = reduce(model, u8::MAX);
+            model = reduce(model, u8::MAX); // Keeps the degree.
             write_atomically(scratch, |out| format.write(&model, out))?;
             let origin = model.origin;
             // The temporary file has no sidecar.

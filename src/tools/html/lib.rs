@@ -55,7 +55,7 @@ pub fn page(title: &str, body: &Markup) -> String {
 /// # Panics
 /// If the text is not an SVG.
 pub fn inline_svg(svg: &str, (width, height): (u32, u32), label: &str) -> Markup {
-    // The start tag is replaced: it has a fixed size, and a name space that HTML does not need.
+    // The start tag is replaced: it has a fixed size, and a namespace that HTML does not need.
     let (tag, rest) = svg.split_once('>').expect("an SVG has a start tag");
     assert!(tag.starts_with("<svg"), "{tag} is not an SVG");
     html! {

@@ -41,6 +41,7 @@ impl Animation {
         let picture = chunk_of(&still, b"VP8L")
             .ok_or_else(|| io::Error::other("the WebP encoder wrote no lossless picture"))?;
         let mut head = Vec::new();
+        // Position, size and duration of the frame.
         for number in [0, 0, self.size.0 - 1, self.size.1 - 1, self.milliseconds.min(0x00ff_ffff)] {
             head.extend(&number.to_le_bytes()[..3]);
         }

@@ -21,14 +21,14 @@ use crate::pictures::{Channels, PictureFolder};
 const FRAMES: u32 = 120;
 const FPS: u32 = 30;
 /// Memory that rendering takes for each pixel of a frame `[bytes]`.
-const PIXEL: u64 = 64;
+const BYTES_PER_PIXEL: u64 = 64;
 
 /// A path of cameras through a scene.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum CameraRoute {
     /// Once around the point that the cameras of the dataset look at.
     Orbit,
-    /// Two turns in front of that point.
+    /// Two turns in front of the point that the cameras of the dataset look at.
     Spiral,
     /// The path of a file, in the coordinates of the dataset.
     File(PathBuf),
@@ -243,7 +243,7 @@ impl Film {
 
 /// Checks that a frame can be allocated, as rendering it would abort the process otherwise.
 fn check_memory((width, height): (u32, u32)) -> Result<(), FilmError> {
-    let bytes = PIXEL * u64::from(width) * u64::from(height);
+    let bytes = BYTES_PER_PIXEL * u64::from(width) * u64::from(height);
     let size = usize::try_from(bytes).unwrap_or(usize::MAX);
     Vec::<u8>::new().try_reserve_exact(size).map_err(|_| FilmError::OutOfMemory {
         width,

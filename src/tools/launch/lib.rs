@@ -21,7 +21,7 @@ use densify_run::failure::{Failure, OTHER};
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
 #[serde(rename_all = "kebab-case")]
 pub enum Engine {
-    /// This machine, as many tasks at once as memory allows
+    /// This machine, as many tasks at once as memory and cores allow
     Local,
     /// Slurm: an array job, with sbatch
     Slurm,

@@ -1,4 +1,4 @@
-//! Runs tasks on this machine, each in its own process, as many at once as fit in memory.
+//! Runs tasks on this machine, each in its own process, as many at once as memory and cores allow.
 
 use std::fs::{self, File, TryLockError};
 use std::path::{Path, PathBuf};

@@ -48,23 +48,23 @@ pub(super) fn group(runs: &[RunRecord]) -> Result<Vec<Scene>, Failure> {
     let mut scenes: Vec<(Scene, PathBuf, Vec<Table>)> = Vec::new();
     for (number, run) in runs.iter().enumerate() {
         let path = run.config.scene_path();
-        let place = path.canonicalize().unwrap_or_else(|_| path.clone());
+        let real_path = path.canonicalize().unwrap_or_else(|_| path.clone());
         let data = DataSpec { no_cache: false, ..run.config.spec.data.clone() };
         let settings = settings(run)?;
         let index = scenes
             .iter()
-            .position(|(scene, other, _)| *other == place && scene.data == data)
+            .position(|(scene, other, _)| *other == real_path && scene.data == data)
             .unwrap_or_else(|| {
                 let label = scene_name(&path);
-                let earlier = scenes.iter().filter(|(_, other, _)| *other == place).count();
+                let earlier = scenes.iter().filter(|(_, other, _)| *other == real_path).count();
                 let is_taken = scenes.iter().any(|(scene, ..)| scene.label == label);
                 let label = match earlier {
                     0 if is_taken => files::one_line(&path.display().to_string()),
                     0 => label,
-                    others => format!("{label}, read with other options ({})", others + 1),
+                    count => format!("{label}, read with other options ({})", count + 1),
                 };
                 let scene = Scene { label, path, data, groups: Vec::new() };
-                scenes.push((scene, place, Vec::new()));
+                scenes.push((scene, real_path, Vec::new()));
                 scenes.len() - 1
             });
         let (scene, _, group_settings) = &mut scenes[index];

@@ -110,10 +110,10 @@ fn views(pictures: &ScenePictures) -> Markup {
     }
 }
 
-/// A photograph and its renders, two of them overlaid with a slider, and a crop of each.
+/// A photograph and its renders, two of these pictures overlaid with a slider, and a crop of each picture.
 fn comparison_figure(view: &ViewComparison) -> Markup {
     let (width, height) = view.pictures[0].picture.size;
-    let several = view.pictures.len() > 2;
+    let has_several_renders = view.pictures.len() > 2;
     html! {
         figure.pair {
             div.stack style=(aspect_style(width, height)) {
@@ -125,7 +125,7 @@ fn comparison_figure(view: &ViewComparison) -> Markup {
             }
             input type="range" min="0" max="100" step="0.5" value="50"
                 aria-label=(format!("Border between the pictures of {}", view.name));
-            @if several {
+            @if has_several_renders {
                 div.choices {
                     (picture_choice("left", "Left", 0, &view.pictures))
                     (picture_choice("right", "Right", 1, &view.pictures))
@@ -135,7 +135,7 @@ fn comparison_figure(view: &ViewComparison) -> Markup {
                 strong { (view.name) } ", " (view.place)
                 @for (run, [psnr, ssim, flip]) in &view.scores {
                     br;
-                    @if several { (run) ": " }
+                    @if has_several_renders { (run) ": " }
                     (format!("PSNR {psnr:.2} dB, SSIM {ssim:.4}, FLIP {flip:.4}"))
                 }
             }
@@ -198,8 +198,8 @@ fn details(run: &RunRecord) -> Result<Markup, Failure> {
             @if reductions.left_out.is_empty() {
                 p { "None" @if reductions.full { ", as requested (--full)" } "." }
             } @else {
-                ul { @for left in &reductions.left_out {
-                    li { strong { (left.what) } ": " (left.evidence) "; " (left.loss) "." }
+                ul { @for reduction in &reductions.left_out {
+                    li { strong { (reduction.what) } ": " (reduction.evidence) "; " (reduction.loss) "." }
                 } }
             }
         }

@@ -239,7 +239,7 @@ mod tests {
         compare_images(image, &expected(), &boundary(), limits)
     }
 
-    fn refused(image: &[f32], limits: Limits, reason: &str) {
+    fn assert_refused(image: &[f32], limits: Limits, reason: &str) {
         let message = outcome(image, limits).expect_err(reason);
         assert!(message.contains(reason), "{message}");
     }
@@ -255,15 +255,15 @@ mod tests {
         assert!(outcome(&corrupted((0..100).step_by(10), alternating), cpu).is_ok());
         assert!(outcome(&corrupted((0..1000).step_by(10), alternating), lenient).is_ok());
         let one = |pixel: usize, by: f32| corrupted([pixel].into_iter(), |_| by);
-        refused(&one(4321, 3e-5), cpu, "pixel 4321");
-        refused(&one(4321, -0.5), cpu, "pixel 4321");
-        refused(&one(7, f32::NAN), cpu, "pixel 7");
-        refused(&one(70, f32::NAN), cpu, "pixel 70");
-        refused(&one(50, 0.006), cpu, "at a boundary");
-        refused(&corrupted((0..110).step_by(10), alternating), cpu, "11 of 10000");
-        refused(&corrupted((0..1000).step_by(10), |_| 0.004), lenient, "bias 1.00");
+        assert_refused(&one(4321, 3e-5), cpu, "pixel 4321");
+        assert_refused(&one(4321, -0.5), cpu, "pixel 4321");
+        assert_refused(&one(7, f32::NAN), cpu, "pixel 7");
+        assert_refused(&one(70, f32::NAN), cpu, "pixel 70");
+        assert_refused(&one(50, 0.006), cpu, "at a boundary");
+        assert_refused(&corrupted((0..110).step_by(10), alternating), cpu, "11 of 10000");
+        assert_refused(&corrupted((0..1000).step_by(10), |_| 0.004), lenient, "bias 1.00");
         let mostly_negative = |k: usize| if k.is_multiple_of(5) { 0.004 } else { -0.004 };
-        refused(&corrupted((0..1000).step_by(10), mostly_negative), lenient, "bias -0.60");
+        assert_refused(&corrupted((0..1000).step_by(10), mostly_negative), lenient, "bias -0.60");
         assert!(outcome(&[0.0; 5], cpu).is_err(), "lengths that disagree");
         for measured in [[0.0, f32::NAN, 0.5], [f32::NAN, 0.0, 0.0]] {
             // The NaN is not hidden by the next channel.

@@ -27,7 +27,7 @@ use super::{Subject, cases};
 /// The kind of output that is made wrong.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Fault {
-    /// Images too bright, each by more than the one before; SSIM too low.
+    /// Images too bright, each more so than the one before; SSIM too low.
     Images,
     /// Gradients, row statistics, losses and SSIM too large.
     Gradients,

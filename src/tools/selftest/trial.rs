@@ -144,14 +144,14 @@ impl<'a> Trial<'a> {
         boundary: &[bool],
     ) {
         let tolerance = self.gradient_tolerance;
-        let mut on_screen = |quantity: &str, found: &[f32], expected: Vec<f64>| {
+        let mut compare = |quantity: &str, found: &[f32], expected: Vec<f64>| {
             self.table.check(label, quantity, relative_error(found, &expected), tolerance);
         };
         let flat = |f: fn(&ScreenGradient) -> Vec<f64>| rows.iter().flat_map(f).collect::<Vec<_>>();
-        on_screen("mean2d", measured.mean2d.as_flattened(), flat(|s| s.mean.to_vec()));
-        on_screen("mean2d_abs", measured.mean2d_abs.as_flattened(), flat(|s| s.mean_abs.to_vec()));
-        on_screen("colour", measured.colour.as_flattened(), flat(|s| s.colour.to_vec()));
-        on_screen("max_weight", &measured.max_weight, flat(|s| vec![s.max_weight]));
+        compare("mean2d", measured.mean2d.as_flattened(), flat(|s| s.mean.to_vec()));
+        compare("mean2d_abs", measured.mean2d_abs.as_flattened(), flat(|s| s.mean_abs.to_vec()));
+        compare("colour", measured.colour.as_flattened(), flat(|s| s.colour.to_vec()));
+        compare("max_weight", &measured.max_weight, flat(|s| vec![s.max_weight]));
         let boundary_pixels = boundary.iter().filter(|b| **b).count() as f64;
         let mut invisible = 0;
         for (row, expected) in rows.iter().enumerate() {

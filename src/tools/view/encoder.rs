@@ -119,6 +119,7 @@ fn draw(
             Drawn { image, range: Some(0.0..MAX_FLIP), mean: Some(mean), distance }
         }
         (PictureKind::Count, _) => {
+            // Counts are rendered as depth.
             let counts = &rendering.depth;
             let most = ends(counts).end.max(1.0);
             let mean =

@@ -51,7 +51,7 @@ const COLOURING_NUMBERS_ON_GPU: usize = 12;
 
 /// Memory of the page during the whole run `[bytes]`: connections, responses, run status, history of the Gaussians, and
 /// the encoder, which may be active at any time. A picture needs the rendering, the photograph (decoded, flattened,
-/// resized in one direction, and resized), their difference with the buffers of the metric, and the encoded picture.
+/// resized in one direction, then in both), their difference with the buffers of the metric, and the encoded picture.
 fn page_bytes(
     largest_image: (u32, u32),
     photograph: u64,

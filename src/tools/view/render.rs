@@ -1,4 +1,4 @@
-//! Renders picture requests. Only this part needs the models, so the thread that owns them, which may be training, does
+//! Renders picture requests. Only rendering needs the models, so the thread that owns them, which may be training, does
 //! no other work for the page.
 
 use std::ops::Range;

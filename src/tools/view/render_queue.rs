@@ -224,8 +224,8 @@ mod tests {
             let second = scope.spawn(|| queue.submit(picture_request("a", 1)));
             assert_eq!(first.join().unwrap().unwrap_err(), RenderError::Superseded);
             let job = queue.next_within(Duration::ZERO).unwrap();
-            queue.finish_rendering(job, Err(RenderError::Failed("made".into())));
-            assert_eq!(second.join().unwrap().unwrap_err(), RenderError::Failed("made".into()));
+            queue.finish_rendering(job, Err(RenderError::Failed("fake".into())));
+            assert_eq!(second.join().unwrap().unwrap_err(), RenderError::Failed("fake".into()));
             assert!(!queue.is_closed());
             queue.close();
             assert!(queue.is_closed() && queue.next_within(Duration::from_secs(60)).is_none());
@@ -256,7 +256,7 @@ mod tests {
             queue.finish(job, Ok(picture));
             assert_eq!(first.join().unwrap().unwrap(), [3]);
             let job = queue.next().unwrap();
-            queue.finish_rendering(job, Err(RenderError::Failed("made".into())));
+            queue.finish_rendering(job, Err(RenderError::Failed("fake".into())));
             assert!(second.join().unwrap().is_err());
             // Closing also answers jobs that are rendered but not encoded.
             let last = scope.spawn(|| queue.submit(picture_request("c", 0)).unwrap_err());
@@ -271,7 +271,7 @@ mod tests {
     #[test]
     fn only_the_newest_request_of_a_pane_is_kept_and_none_starves() {
         let queue = RenderQueue::new(None, 1);
-        let failed = || RenderError::Failed("made".into());
+        let failed = || RenderError::Failed("fake".into());
         let waiting = |count: usize| wait_until(&queue, |jobs| jobs.waiting.len() >= count);
         let newest_is = |number: usize| {
             let newest = picture_request("a", number);

@@ -13,7 +13,7 @@ use densify_train::trainer::RowHistory;
 
 /// Background of coloured Gaussians: darker than the dark end of the colour map.
 pub(super) const BACKGROUND: [f32; 3] = [0.02, 0.02, 0.03];
-/// Fraction of the values at each end that a fitted scale ignores.
+/// Fraction of the values at each end that a scale ignores if the values determine its ends.
 const OUTLIERS: f64 = 0.01;
 /// Signals that measure the gradient, in order of preference.
 const GRADIENTS: [Signal; 2] = [Signal::ScreenGradient, Signal::ScreenGradientAbs];

@@ -42,7 +42,7 @@ pub(super) enum Command {
     Stop,
 }
 
-/// A point of the curves: the means over one record.
+/// A point of the curves: the means over the steps of one record.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 struct Point {
     step: u32,

@@ -151,7 +151,7 @@ impl Scene {
         scene
     }
 
-    /// The scene of a run in training, which its own backend renders, in pictures no larger than its photographs.
+    /// The scene of a run in training, which the run's own backend renders, in pictures no larger than the photographs.
     pub(super) fn of_run(run: &mut Run) -> Self {
         let counts = counts_rows(run.trainer.backend());
         let (rows, signals) = (run.trainer.rows(), run.trainer.signals());

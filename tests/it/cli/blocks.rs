@@ -148,8 +148,8 @@ fn scheduler_scripts_produce_the_same_model() {
     let requested: i64 = requested.trim_end_matches('M').parse().expect("a number");
     assert_eq!(requested, (most + (1 << 20) - 1) >> 20);
     assert!(array.contains("#SBATCH --array=0,1\n") && array.contains("#SBATCH --requeue\n"));
-    for (name, place) in [("coarse", ""), ("blocks", "1"), ("blocks", "0"), ("merge", "")] {
-        run_array_task(&script(name), place);
+    for (name, index) in [("coarse", ""), ("blocks", "1"), ("blocks", "0"), ("merge", "")] {
+        run_array_task(&script(name), index);
     }
     assert!(read(&folder.join("merged.ply")) == read(&local.join("merged.ply")));
 
@@ -183,8 +183,8 @@ fn impossible_plans_are_refused_and_write_nothing() {
     };
     plan("--rows 400 --blocks 9x9 -- -i 20").refused("too many", &["of 9x9", "--blocks", "--rows"]);
     plan("--rows 50 --blocks 2").refused("too few rows", &["50 Gaussians", "--rows"]);
-    plan("--rows 400 --blocks 2 -- --view").refused("own", &["--view"]);
-    plan("--rows 400 --blocks 2 -- --budget 9").refused("own", &["--budget", "plan itself"]);
+    plan("--rows 400 --blocks 2 -- --view").refused("the plan's", &["--view"]);
+    plan("--rows 400 --blocks 2 -- --budget 9").refused("the plan's", &["--budget", "plan itself"]);
     plan("--rows 400 --blocks 2 -- --sh-degree auto").refused("auto", &["--sh-degree auto"]);
     plan("--rows 400 --blocks 2 -- --coordinates double").refused("f64", &["--coordinates double"]);
     plan("--rows 400 --blocks 2 -- --exposure auto")

@@ -219,8 +219,8 @@ fn scheduler_runs_match_local_ones_and_are_collected_by_repeating_the_call() {
     assert!(shown.contains(&text_of_script), "{shown}");
     assert!(text_of_script.contains("#SBATCH --array=0,1,2,3,4,5,6,7\n"), "{text_of_script}");
     assert!(text_of_script.contains("#SBATCH --cpus-per-task=1\n"), "{text_of_script}");
-    for place in ["3", "0", "1", "2", "4", "5", "6"] {
-        run_array_task(&script, place);
+    for index in ["3", "0", "1", "2", "4", "5", "6"] {
+        run_array_task(&script, index);
     }
     let stdout = submit("", &path).ok().stdout;
     assert!(stdout.contains("7 of 8 done") && stdout.contains("as job 7"), "{stdout}");

@@ -63,10 +63,10 @@ fn every_format_is_written_compared_and_read_back() {
     };
     assert!(line("ply").ends_with("same") && line("glb").ends_with("same"), "{outcome:?}");
     // The lowest accepted PSNR [dB] for trained scenes; this one has hardly been trained.
-    for (name, least) in [("compressed-ply", 45.0), ("spz", 45.0), ("spz-v4", 45.0), ("sog", 42.0)]
+    for (name, floor) in [("compressed-ply", 45.0), ("spz", 45.0), ("spz-v4", 45.0), ("sog", 42.0)]
     {
         let psnr: f64 = line(name).split_whitespace().last().unwrap().parse().unwrap();
-        assert!(psnr > least, "{}", line(name));
+        assert!(psnr > floor, "{}", line(name));
     }
     let saved = read(&densify::train::output::model_path(&run, 20));
     let name = run.file_name().unwrap().to_str().unwrap();
@@ -95,8 +95,8 @@ fn every_format_is_written_compared_and_read_back() {
     let names: Vec<_> = files(&others).into_keys().collect();
     let expected = ["glb", "ply", "sog"].map(|extension| format!("re.mote.{extension}"));
     assert!(expected.iter().all(|name| names.contains(name)), "{names:?}");
-    // SPZ cannot represent the position. In the compressed PLY, the other Gaussians of its chunk would collapse to a
-    // plane.
+    // SPZ cannot represent the position. In the compressed PLY, the other Gaussians of the same chunk would collapse to
+    // a plane.
     let unfit = |name: &String| name.ends_with("spz") || name.contains("compressed");
     assert!(!names.iter().any(unfit), "{names:?}");
     let refused =

@@ -16,7 +16,7 @@ fn assert_same(a: &Dataset, b: &Dataset, case: &str) {
     for (x, y) in a.train.iter().zip(&b.train) {
         let apart = x.camera.centre().distance(y.camera.centre());
         let turned = x.camera.forward().distance(y.camera.forward());
-        assert!(apart < 1e-9 && turned < 1e-9, "{case}: {} by {apart}, {turned}", x.name);
+        assert!(apart < 1e-9 && turned < 1e-9, "{case}: {} differs by {apart}, {turned}", x.name);
         assert!((x.camera.fx - y.camera.fx).abs() < 1e-9, "{case}");
         let [x, y] = [x, y].map(|view| view.source.load().expect("an image"));
         assert!(x == y, "{case}");

@@ -35,7 +35,7 @@ impl Page {
     fn wait_for_pause(&self) -> u64 {
         loop {
             let now = self.progress();
-            // After an ordered step, the count changes before the step is taken, so it is read twice.
+            // After the order "step", the state is "paused" before the step is taken, so the step is read twice.
             if now["state"] == "paused" && self.progress()["step"] == now["step"] {
                 return count(&now, "step");
             }

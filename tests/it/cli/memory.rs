@@ -244,10 +244,10 @@ fn too_little_memory_is_refused_with_remedies_in_order_of_cost() {
         let outcome = train(scene.path(), &run, &format!("--memory 1MiB {flags}"));
         outcome.refused(flags, &["--memory 1.0 MiB", "1,000 rows", "give --memory"]);
         assert!(files(root.path()).is_empty(), "{flags}");
-        let [least] = &remedies(&outcome)[..] else { panic!("expected one remedy") };
-        plan(&apply_remedy(flags, least)).ok();
-        let mib = least.trim_start_matches("--memory ").trim_end_matches("MiB");
-        let mib: u64 = mib.parse().unwrap_or_else(|e| panic!("{least}: {e}"));
+        let [more_memory] = &remedies(&outcome)[..] else { panic!("expected one remedy") };
+        plan(&apply_remedy(flags, more_memory)).ok();
+        let mib = more_memory.trim_start_matches("--memory ").trim_end_matches("MiB");
+        let mib: u64 = mib.parse().unwrap_or_else(|e| panic!("{more_memory}: {e}"));
         // Bisects for the largest limit [KiB] that is too small: there, every remedy saves enough.
         let (mut too_small, mut enough) = ((mib - 1) << 10, mib << 10);
         while enough - too_small > 1 {
@@ -257,7 +257,7 @@ fn too_little_memory_is_refused_with_remedies_in_order_of_cost() {
         }
         let flags = format!("--memory {too_small}KiB {flags}");
         let outcome = plan(&flags);
-        outcome.refused(&flags, &[least]);
+        outcome.refused(&flags, &[more_memory]);
         let all = remedies(&outcome);
         assert_eq!(all[..2], ["--image-cache 0", second], "{flags}: {all:?}");
         for remedy in all {

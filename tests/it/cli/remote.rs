@@ -43,7 +43,7 @@ fn means_in_checkpoint(run: &Path) -> Vec<u8> {
 }
 
 #[test]
-fn a_remote_model_keeps_its_quality_or_a_note_says_otherwise() {
+fn a_model_far_from_the_origin_keeps_its_quality_or_is_noted() {
     let (scene, far) = (Photographs::colmap_text(), Photographs::colmap_text_at(UTM));
     let root = tempfile::tempdir().unwrap();
     let run = |name: &str, scene: &Photographs, flags: &str| {

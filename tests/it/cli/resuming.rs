@@ -157,9 +157,9 @@ fn checkpoints_contain_all_state_that_lasts_between_steps() {
         "--policy vanilla --policy-set vanilla.grow_every=9 --tile-cap 400 --seed 5",
         "--policy diet --policy-set diet.grow_every=9 --save-iterations 50,150 --eval \
          --test-iterations 30,101,160",
-        // Candidates are pending at the checkpoint.
         "--policy vanilla --policy-set vanilla.grow_every=9",
         "--policy mcmc --policy-set mcmc.grow_every=7 --threads 2",
+        // Candidates are pending at the checkpoint.
         "--policy diet --policy-set diet.grow_every=9 --policy-set diet.insert_every=19 \
          --policy-set diet.rows_per_candidate=20 --policy-set diet.compensate_from=60 \
          --policy-set diet.rho_c=0.1",

@@ -113,7 +113,7 @@ pub(super) fn call() -> impl Strategy<Value = Call> {
 }
 
 /// Makes a call; returns true if the plan accepted it.
-pub(super) fn enter(plan: &mut EditPlan, call: &Call) -> bool {
+pub(super) fn make_call(plan: &mut EditPlan, call: &Call) -> bool {
     let done = match *call {
         Call::Prune(row) => plan.prune(row),
         Call::Grow(row, how) => plan.grow(row, how),

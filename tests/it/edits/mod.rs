@@ -22,7 +22,7 @@ use proptest::prelude::*;
 use proptest::test_runner::TestRunner;
 
 use crate::subject::{cases_on, make_with, repeatable, step_input, turned_away};
-use calls::{Call, call, enter};
+use calls::{Call, call, make_call};
 use plain::{Row, execute};
 
 const ROWS: usize = 37;
@@ -135,15 +135,15 @@ fn check_movement(twin: &[Vec<Row>; 2], before: &[Row], after: &[Row], expected:
     for (i, expected) in expected.iter().enumerate() {
         let (from, to) = (&before[i], &after[i]);
         assert_eq!(to.signals[2], from.signals[2] + 1.0, "age of row {i}");
-        let Some(same) = expected.moments else {
+        let Some(twin_row) = expected.moments else {
             assert_eq!((from.mean, from.log_scale), (to.mean, to.log_scale), "newborn row {i}");
             assert_eq!((confined(from.logit), &from.sh), (to.logit, &to.sh), "newborn row {i}");
             assert_close("quat", i, &to.quat, &from.quat);
             continue;
         };
-        let (was, is) = (&twin_before[same], &twin_after[same]);
-        assert!(was.mean != is.mean, "row {same} of the twin has no moments to compare");
-        assert_eq!(to.quat, is.quat, "row {i}, twin row {same}");
+        let (was, is) = (&twin_before[twin_row], &twin_after[twin_row]);
+        assert!(was.mean != is.mean, "row {twin_row} of the twin has no moments to compare");
+        assert_eq!(to.quat, is.quat, "row {i}, twin row {twin_row}");
         let moved = |x: f32, was: f32, is: f32| x + (is - was);
         // Exact, except for rows that an update has moved.
         let follows = |quantity, from: &[f32], to: &[f32], was: &[f32], is: &[f32]| {
@@ -176,7 +176,7 @@ fn check_plans(subject: &Subject, twin: &[Vec<Row>; 2], spare: usize, plans: &[V
     for (event, calls) in (4..).zip(plans) {
         let mut plan = EditPlan::new(backend.rows(), budget).allowing(&needs());
         let taken: Vec<Call> =
-            calls.iter().filter(|call| enter(&mut plan, call)).cloned().collect();
+            calls.iter().filter(|call| make_call(&mut plan, call)).cloned().collect();
         let ops = plan.compile();
         backend.apply(&ops, SEED, event).expect("a plan is applied");
         history.record(&ops, event);

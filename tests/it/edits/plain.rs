@@ -97,15 +97,15 @@ impl Row {
         self
     }
 
-    /// The child `number` of a parent in slot `slot`.
-    fn child(&self, slot: u32, number: u32, how: &Offspring, rng: &PolicyRng) -> Self {
+    /// The child `number` of this parent, whose index is `row`.
+    fn child(&self, row: u32, number: u32, how: &Offspring, rng: &PolicyRng) -> Self {
         let mut child = self.clone().newborn();
         let axis = longest(self.log_scale);
         let offset = match how.placement {
             Placement::Offset(_) if number == 0 => DVec3::ZERO,
             Placement::Offset(offset) => offset.map(f64::from).into(),
             Placement::Sampled => {
-                let xi = rng.normal3(slot, Purpose::Place, number);
+                let xi = rng.normal3(row, Purpose::Place, number);
                 self.turned(
                     [0, 1, 2].map(|i| f64::from(self.log_scale[i]).exp() * f64::from(xi[i])),
                 )

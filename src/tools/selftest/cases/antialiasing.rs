@@ -8,7 +8,7 @@ use densify_core::camera::Camera;
 use densify_core::gaussians::Gaussians;
 use densify_render::BackendError;
 
-/// A cloud whose Gaussians are `size` times as large, opaque enough to be seen at a fraction of a pixel.
+/// A cloud whose Gaussians are scaled by `size`, opaque enough to be seen at a fraction of a pixel.
 fn cloud(camera: &Camera, size: f32, antialiasing: Antialiasing) -> Gaussians {
     let mut model = scenes::cloud(30, 1, camera, 33);
     model.antialiasing = antialiasing;
@@ -29,7 +29,7 @@ pub(super) fn sizes(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     let camera = scenes::camera(49, 35, 10);
     let small = axis_camera(24, 20);
     for kind in [Antialiasing::Wide, Antialiasing::Narrow] {
-        // From 4 to 0.02 px at the median; the faintest are below the threshold of blending.
+        // From 4 to 0.09 px at the median; the faintest are below the threshold of blending.
         for size in [1.0, 0.1, 0.02] {
             let label = format!("{kind}, {size} times");
             trial.check(&label, &cloud(&camera, size, kind), &camera, GREEN, 1)?;

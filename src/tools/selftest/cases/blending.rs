@@ -93,7 +93,7 @@ fn side_by_side(trial: &mut Trial<'_>) -> Result<(), BackendError> {
 
 pub(super) fn behind_opaque(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     let camera = axis_camera(21, 17);
-    // Alphas of the last two opacities are clamped to 0.99 at the row's centre.
+    // The last two opacities are clamped to an alpha of 0.99 at the centre of the opaque row.
     for opacity in [0.98, 0.9895, 0.9995, 0.9999] {
         let mut model = Gaussians::default();
         for row in 0..41_u8 {

@@ -46,7 +46,7 @@ pub(super) fn camera_inside(trial: &mut Trial<'_>) -> Result<(), BackendError> {
         }
         let mut back = scenes::cloud(10, 0, &camera, 34);
         back.append(model);
-        let label = format!("{times} times as wide as distant");
+        let label = format!("as wide as {times} times the distance");
         trial.check(&label, &back, &camera, GREEN, 0)?;
     }
     Ok(())

@@ -101,8 +101,8 @@ pub(super) fn needles(trial: &mut Trial<'_>) -> Result<(), BackendError> {
             let model = needle(sigma_px, turn);
             let (measured, expected) = trial.check(&label, &model, &camera, GREEN, 0)?;
             let log_scales = measured.log_scales[0].map(f64::from);
-            let found = by_covariance(&model, log_scales, measured.quats[0].map(f64::from));
-            let exact = by_covariance(&model, expected.log_scales[0], expected.quats[0]);
+            let found = covariance_gradient(&model, log_scales, measured.quats[0].map(f64::from));
+            let exact = covariance_gradient(&model, expected.log_scales[0], expected.quats[0]);
             trial.record(&label, "covariance gradient", relative_error(&found, &exact), 1e-3);
         }
     }
@@ -120,7 +120,7 @@ pub(super) fn needles(trial: &mut Trial<'_>) -> Result<(), BackendError> {
 ///
 /// Log-scales change the diagonal D of Σ = R D Rᵀ by 2D. A rotation δ about an axis of the row changes q by half
 /// of q ⊗ (0, δ), and the elements ij and ji of the other two axes by (Dᵢ − Dⱼ) δ.
-fn by_covariance(model: &Gaussians, d_log_scales: [f64; 3], d_quat: [f64; 4]) -> [f64; 5] {
+fn covariance_gradient(model: &Gaussians, d_log_scales: [f64; 3], d_quat: [f64; 4]) -> [f64; 5] {
     let variance = model.log_scales[0].map(|log| (2.0 * f64::from(log)).exp());
     let [w, x, y, z] = model.quats[0].map(f64::from);
     let [gw, gx, gy, gz] = d_quat;

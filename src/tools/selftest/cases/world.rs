@@ -31,7 +31,7 @@ fn rig() -> (Vec<Camera>, Vec<DVec3>) {
     (cameras.collect(), points.collect())
 }
 
-/// Renders the first camera's view after the world is rotated by `turn` and moved by `place`.
+/// Renders the first camera's view after the world is rotated by `turn` and then shifted or scaled by `place`.
 fn render_placed(
     trial: &Trial<'_>,
     turn: DMat3,

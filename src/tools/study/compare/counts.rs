@@ -35,7 +35,7 @@ pub(super) fn add_tables(document: &mut Document, outcomes: &[Outcome], policies
     document.section("Gaussians at the end and at the true peak");
     document.paragraph(
         "At the end: means over seeds. True peak: the maximum at any instant of any seed. The \
-        tables above compare policies at equal peaks; these also show how many Gaussians each ends with.",
+        tables above compare policies at equal budgets, which limit the peak; these show where each policy ends.",
     );
     for budget in budgets(outcomes) {
         let scenes =

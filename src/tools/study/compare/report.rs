@@ -132,7 +132,7 @@ fn row(policy: &str, first: &str, here: &[&Outcome], budget: usize) -> Vec<Text>
     ]
 }
 
-/// A geometric error.
+/// A geometric measurement.
 type Measure = fn(&Geometry) -> f64;
 
 /// Adds the table of geometric errors, if the surface of the scene is known.

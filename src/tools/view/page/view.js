@@ -127,6 +127,8 @@ const REST = 30;
 const PACE = 45;
 /** The two shown pictures: bitmaps with their data. */
 const shown = [null, null];
+/** Size of coarse pictures relative to sharp ones, version of the last sharp picture, place of the border, what ends
+ * a pause, and the latest times between pictures [ms]. */
 let coarse = 0.5, complete = -1, border = 0.5, wakeUp = () => {}, paces = [];
 /** Latency of a reply that needs no rendering, and time per byte of a reply [ms]. */
 let latency = 0, perByte = 0;
@@ -558,7 +560,7 @@ document.addEventListener("keydown", (event) => {
   else if (key === "[") step(-1);
   else if (key === "]") step(1);
   else if (low === "r") goHome();
-  else if (low === "k") addKey();
+  else if (low === "k") addKeyframe();
   else if (low === "h" || key === "?") showHelp();
   else return;
   event.preventDefault();
@@ -620,16 +622,16 @@ function goHome() {
 
 // ---- Camera paths, in nerfstudio's format, which densify render reads.
 
-const keys = [];
+const keyframes = [];
 let flight = null;
 
-function addKey() {
-  keys.push({ ...pose(), aspect: area()[0] / area()[1] });
+function addKeyframe() {
+  keyframes.push({ ...pose(), aspect: area()[0] / area()[1] });
   showPath();
 }
 
 function showPath() {
-  const count = keys.length;
+  const count = keyframes.length;
   byId("path-state").textContent = count
     ? `${count} ${count === 1 ? "camera" : "cameras"}. Saved, densify render RUN -o frames --path FILE flies along them.`
     : "Add cameras; densify render --path FILE flies along them.";
@@ -648,9 +650,9 @@ function quaternion({ camera_to_world: m }) {
 
 /** Sets the camera to a position on the path, a Catmull-Rom spline, in intervals from its first camera. */
 function setOnPath(place) {
-  const loops = byId("loop").checked, count = keys.length;
+  const loops = byId("loop").checked, count = keyframes.length;
   const first = Math.min(Math.floor(place), loops ? count - 1 : count - 2), t = place - first;
-  const key = (i) => keys[loops ? (i + count) % count : clamp(i, 0, count - 1)];
+  const key = (i) => keyframes[loops ? (i + count) % count : clamp(i, 0, count - 1)];
   const near = [first - 1, first, first + 1, first + 2].map(key);
   const t2 = t * t, t3 = t2 * t;
   const weights = [2 * t2 - t - t3, 3 * t3 - 5 * t2 + 2, t + 4 * t2 - 3 * t3, t3 - t2].map((w) => w / 2);
@@ -668,7 +670,7 @@ function setOnPath(place) {
 }
 
 /** Number of intervals between cameras of the path. */
-const intervals = () => keys.length - (byId("loop").checked ? 0 : 1);
+const intervals = () => keyframes.length - (byId("loop").checked ? 0 : 1);
 
 function play() {
   flight = flight ? null : performance.now();
@@ -693,7 +695,7 @@ function savePath() {
   const [width, height] = area().map((side) => Math.round(side * devicePixelRatio));
   const path = {
     camera_type: "perspective", render_width: width, render_height: height, fps: 30,
-    seconds: 2 * Math.max(1, intervals()), is_cycle: byId("loop").checked, camera_path: keys,
+    seconds: 2 * Math.max(1, intervals()), is_cycle: byId("loop").checked, camera_path: keyframes,
   };
   const link = document.createElement("a");
   link.href = URL.createObjectURL(new Blob([JSON.stringify(path, null, 1)], { type: "application/json" }));
@@ -787,8 +789,8 @@ function addListeners() {
   on("home", "click", goHome);
   on("fov", "input", () => { leaveView(); camera.fov = Number(byId("fov").value); showControls(); changed(); });
   on("speed", "input", showControls);
-  on("add", "click", addKey);
-  on("remove", "click", () => { keys.pop(); showPath(); });
+  on("add", "click", addKeyframe);
+  on("remove", "click", () => { keyframes.pop(); showPath(); });
   on("play", "click", play);
   on("save", "click", savePath);
   on("help", "click", showHelp);
