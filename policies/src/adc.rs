@@ -48,15 +48,15 @@ impl Window {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct OpacityResets {
     regular: Window,
-    /// Step of the additional reset of a scene on a white background.
+    /// Step of the additional reset; `None` if the background is not white.
     white: Option<u32>,
     /// Largest opacity after a reset, in (0, 1).
     max_opacity: f32,
 }
 
 impl OpacityResets {
-    /// Resets to at most `reset_opacity` at the multiples of `every` before `until`, and at
-    /// `white_at` if the scene's background is white (all in steps; 0: never).
+    /// Before `until`, limits opacities to `reset_opacity` at the multiples of `every` and, if the scene's
+    /// background is white, at `white_at` (all three in steps; 0: never).
     ///
     /// # Errors
     /// When `reset_opacity`, rounded to f32, is not in (0, 1).
@@ -117,7 +117,7 @@ pub fn mean_over_views(sum: &[f32], views: &[f32]) -> Vec<f32> {
 /// Adds to `gradient` the mean of the colour gradient over views, times `weight`.
 ///
 /// # Errors
-/// When the policy has not declared [`Signal::ColourGradient`].
+/// When the policy does not declare [`Signal::VisibleCount`] or [`Signal::ColourGradient`].
 pub(crate) fn add_colour_gradient(
     gradient: &mut [f32],
     now: &Snapshot<'_>,
@@ -143,7 +143,7 @@ pub fn clone_at(offset: [f32; 3]) -> Offspring {
     }
 }
 
-/// A split: two children, sampled from the parent and smaller by `factor`, replace it.
+/// A split: two children, sampled from the parent and with its scales divided by `factor`, replace it.
 pub fn split_by(factor: f32) -> Offspring {
     Offspring {
         parent: ParentFate::BecomesChild,
@@ -177,8 +177,8 @@ pub struct PruneLimits {
 }
 
 impl PruneLimits {
-    /// The limits at an event. `max_scale` is a fraction of the scene extent and applies after step
-    /// `max_scale_from`; 0: no limit.
+    /// The limits at an event. `max_scale` is a fraction of the scene extent (0: no limit) and applies after
+    /// step `max_scale_from`.
     pub fn at(now: &Snapshot<'_>, min_opacity: f64, max_scale: f64, max_scale_from: u32) -> Self {
         let limits_size = max_scale > 0.0 && now.step > max_scale_from;
         let max_scale = (max_scale * f64::from(now.scene.extent)) as f32;
@@ -199,7 +199,7 @@ impl PruneLimits {
     /// The rows to prune, ascending.
     ///
     /// # Errors
-    /// When the policy does not declare [`Signal::Opacity`] and [`Signal::ScaleMax`].
+    /// When the policy does not declare [`Signal::Opacity`] or [`Signal::ScaleMax`].
     pub fn dead_rows(&self, now: &Snapshot<'_>) -> PolicyResult<Vec<u32>> {
         let (opacity, scale) = (now.signal(Signal::Opacity)?, now.signal(Signal::ScaleMax)?);
         let rows = (0..).zip(opacity).zip(scale);

@@ -9,9 +9,9 @@ use crate::signals::SignalSet;
 /// The children of a clone or a split, and the fate of the parent.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Offspring {
-    /// New rows in addition to the parent's own slot, >= 1.
+    /// Number of new rows, >= 1; the parent's own row is not counted.
     pub children: u32,
-    /// Fate of the parent's own slot.
+    /// Fate of the parent's row.
     pub parent: ParentFate,
     /// Positions of the children.
     pub placement: Placement,
@@ -44,7 +44,7 @@ pub enum Placement {
     /// Every child at mean + R·diag(s)·ξ, where ξ ~ N(0, I) and s are the parent's scales (the original adaptive
     /// density control, Kerbl et al. 2023, section 5.2).
     Sampled,
-    /// Children at ±`sigmas`·s along the parent's longest axis: even children +, odd children −.
+    /// Children on the parent's longest axis, `sigmas` from its mean: even children at +, odd children at −.
     LongAxis {
         /// Distance from the parent's mean in standard deviations of its longest axis.
         sigmas: f32,

@@ -16,7 +16,7 @@ pub enum PolicyError {
         signal: Signal,
     },
     /// The policy read a column of an auxiliary view that its
-    /// [`Needs::aux`](crate::policy::Needs::aux) do not list.
+    /// [`Needs::aux`](crate::policy::Needs::aux) does not list.
     #[error("column {column:?} was read but not declared; list it in `needs` under `aux`")]
     UndeclaredColumn {
         /// The undeclared column.

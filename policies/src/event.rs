@@ -176,7 +176,7 @@ impl Outcome {
             let families = ops.families.iter().filter(move |f| f.fate() == fate);
             families.map(|family| family.parent).collect()
         };
-        // Pruned rows are those whose slots are overwritten, and those of the tail that do not move.
+        // Pruned rows are those whose slots are overwritten, and those beyond the new end that are not moved.
         let is_overwritten = |row: &u32| {
             ops.child_slots.contains(row)
                 || ops.seeds.iter().any(|(slot, _)| slot == row)

@@ -45,10 +45,11 @@
 //!    listed in [`STEP_PARAMETERS`](registry::ConfiguredPolicy::STEP_PARAMETERS), as a step or an interval,
 //!    scale with the length of the run.
 //! 3. **Needs**: the [`Signal`](policy::Signal)s that it reads. Only these are accumulated, and reading
-//!    another is an error. Signals measured in training cost little. Auxiliary views
+//!    any other is an error. Signals measured in training cost little. Auxiliary views
 //!    ([`Needs::aux`](policy::Needs::aux)) cost extra renders, so the policy requests them only for the
-//!    events that need them ([`aux_views`](policy::DensityPolicy::aux_views)). Loss terms, noise, learning
-//!    rates, the interval of optimiser steps and changes to the initial model are declared here too.
+//!    events (the steps at which it plans) that need them ([`aux_views`](policy::DensityPolicy::aux_views)).
+//!    Loss terms, noise, learning rates, the interval of optimiser steps and changes to the initial model are
+//!    declared here too.
 //! 4. **A plan**: at the steps at which it is due, the policy reads the
 //!    [`Snapshot`](policy::Snapshot) and adds edits to the [`EditPlan`](plan::EditPlan).
 //! 5. **State**, if it has any: [`save`](policy::DensityPolicy::save) and
@@ -58,9 +59,9 @@
 //! Rules:
 //!
 //! - The plan keeps the budget. A call that would exceed it is refused and counted as denied; a refusal
-//!   is not an error. At the budget, prune first, then grow: a pruned row frees its slot within the
+//!   is not an error. At the budget, prune first, then grow: a pruned row makes room within the
 //!   same plan.
-//! - Each row has at most one edit in a plan. Rows are identified by their index before the edit.
+//! - Each row has at most one edit in a plan. Rows are identified by their index before the plan is executed.
 //! - Signals may hold any value, such as zero views, or NaN from a broken Gaussian. The functions of
 //!   [`sample`] sort NaN last.
 //! - Runs are reproducible: draw random numbers only from the

@@ -77,8 +77,8 @@ impl<'a> Neighbours<'a> {
             // By the triangle inequality, the previous point's neighbours are within this bound, with a
             // margin for rounding.
             let bound = previous.map_or(f64::INFINITY, |(previous, farthest)| {
-                let step = squared_distance(self.points[previous], self.points[index]).sqrt();
-                (farthest.sqrt() + step).powi(2) * (1.0 + 1e-9) + f64::MIN_POSITIVE
+                let moved = squared_distance(self.points[previous], self.points[index]).sqrt();
+                (farthest.sqrt() + moved).powi(2) * (1.0 + 1e-9) + f64::MIN_POSITIVE
             });
             let found = self.nearest_below(index, bound, &mut buffer);
             visit(index, found);
@@ -228,10 +228,10 @@ mod tests {
         for k in [0, 1, 2, 30, 699, 900] {
             let mut buffer = vec![NOT_FOUND; k];
             let mut visits = vec![0; points.len()];
-            let mut together = vec![Vec::new(); points.len()];
+            let mut by_visit = vec![Vec::new(); points.len()];
             tree.for_each_nearest(k, |index, found| {
                 visits[index] += 1;
-                together[index] = found.iter().map(|other| other.square).collect();
+                by_visit[index] = found.iter().map(|other| other.square).collect();
             });
             assert_eq!(visits, vec![1; points.len()]);
             for (i, a) in points.iter().enumerate().step_by(7) {
@@ -242,7 +242,7 @@ mod tests {
                 let found = tree.nearest(i, &mut buffer);
                 let squares: Vec<f64> = found.iter().map(|other| other.square).collect();
                 assert_eq!(squares, expected, "{k} neighbours of {i}");
-                assert_eq!(together[i], expected, "{k} neighbours of {i}, all together");
+                assert_eq!(by_visit[i], expected, "{k} neighbours of {i}, by for_each_nearest");
                 for other in found {
                     let expected = square(a, &points[other.index as usize]);
                     assert_eq!(other.square.to_bits(), expected.to_bits());

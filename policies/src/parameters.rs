@@ -119,11 +119,11 @@ pub(crate) fn scale_steps(table: &mut Table, parameters: &[StepParameter], itera
             && *steps > 0
         {
             let factor = f64::from(iterations) / f64::from(REFERENCE_ITERATIONS);
-            let least = match parameter {
+            let minimum = match parameter {
                 StepParameter::Interval(_) => (*steps).min(MIN_INTERVAL),
                 StepParameter::Step(_) => 1,
             };
-            *steps = ((*steps as f64 * factor).round() as i64).max(least);
+            *steps = ((*steps as f64 * factor).round() as i64).max(minimum);
         }
     }
 }

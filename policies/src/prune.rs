@@ -126,7 +126,7 @@ mod tests {
         assert_eq!(take(&mut sums, 7, 3), None);
     }
 
-    /// The rows that are pruned, excluding those in `before`.
+    /// The rows that `victims` prunes in a plan that has already pruned those in `before`.
     fn pruned(
         victims: Victims,
         measure: &[f32],

@@ -40,7 +40,7 @@ impl PolicyRng {
         pcg4d([row, self.step, self.seed, (purpose as u32) << 16 ^ counter])
     }
 
-    /// A number in (0, 1): (k + ½) / 2²³.
+    /// A number in (0, 1): (k + ½) / 2²³ with a random k of 23 bits.
     pub fn uniform(&self, row: u32, purpose: Purpose) -> f32 {
         unit_open(self.bits(row, purpose, 0)[0])
     }
@@ -156,17 +156,17 @@ mod tests {
         let u = |rng: PolicyRng, row: u32, purpose| rng.uniform(row, purpose);
         let select = Purpose::Select;
         type Pair<'a> = (&'a str, &'a dyn Fn(u32) -> (f32, f32));
-        let other =
+        let versus =
             |seed, step| move |i| (u(rng, i, select), u(PolicyRng::new(seed, step), i, select));
         let pairs: [Pair<'_>; 8] = [
             ("rows", &|i| (u(rng, 2 * i, select), u(rng, 2 * i + 1, select))),
-            ("steps", &other(9, 601)),
+            ("steps", &versus(9, 601)),
             ("step by step", &|i| {
                 let at = |step| u(PolicyRng::new(9, step), 5, select);
                 (at(2 * i), at(2 * i + 1))
             }),
-            ("seeds", &other(10, 600)),
-            ("high halves of seeds", &other(9 + (1 << 32), 600)),
+            ("seeds", &versus(10, 600)),
+            ("high halves of seeds", &versus(9 + (1 << 32), 600)),
             ("purposes", &|i| (u(rng, i, select), u(rng, i, Purpose::Place))),
             ("purposes", &|i| (u(rng, i, Purpose::Noise), u(rng, i, Purpose::Place))),
             ("counters", &|i| {

@@ -73,7 +73,7 @@ macro_rules! signals {
                 }
             }
 
-            /// Additional sums in the backward pass.
+            /// The additional sums in the backward pass that the signal needs.
             pub const fn pixel_sums(self) -> &'static [PixelSum] {
                 match self {
                     $(Self::$name => &[$(PixelSum::$sum),*],)*
@@ -114,7 +114,7 @@ signals! {
     /// [`WeightSum`](Self::WeightSum) it is the mean error where the row is visible. The error map and pixel
     /// weights of [`Needs::error_score`](crate::policy::Needs::error_score) apply to this sum, too.
     WeightedError: Sum "pixels" [WeightedError];
-    /// Sum over views of the row's error, >= 0, as defined by [`ErrorScore`](crate::policy::ErrorScore).
+    /// Sum over views of the row's error score, >= 0, as defined by [`ErrorScore`](crate::policy::ErrorScore).
     ErrorScore: Sum "1" [Weight, WeightedError];
     /// Sum over views of √w, >= 0, where w is the row's largest blend weight α·T in the view. Divided by
     /// [`VisibleCount`](Self::VisibleCount) it tells how much a row matters in all views that see it,

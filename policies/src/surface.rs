@@ -7,9 +7,9 @@ use crate::neighbours::Neighbours;
 use crate::plan::{EditPlan, Reset, Seed};
 use crate::policy::Candidate;
 
-/// Smallest size of a row, as a fraction of the scene extent and as in the initialisation: closer points count as the
-/// same surface point.
-const LEAST_DISTANCE: f64 = 2e-4;
+/// Smallest size of a row, as a fraction of the scene extent, as for the points of the initial model: closer points
+/// count as the same surface point.
+const MIN_SIZE: f64 = 2e-4;
 /// Size of a row without neighbours, as a fraction of the scene extent.
 const LONE_SIZE: f64 = 0.02;
 
@@ -21,7 +21,7 @@ pub fn sizes(positions: &[[f64; 3]], extent: f32) -> Vec<f32> {
         return vec![(LONE_SIZE * extent) as f32];
     }
     let neighbours = Neighbours::new(positions);
-    let size = |index| neighbours.mean_square_distance(index).sqrt().max(LEAST_DISTANCE * extent);
+    let size = |index| neighbours.mean_square_distance(index).sqrt().max(MIN_SIZE * extent);
     (0..positions.len()).map(|index| size(index) as f32).collect()
 }
 

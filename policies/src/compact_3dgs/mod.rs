@@ -13,8 +13,8 @@
 //!
 //! **Mask.** Each Gaussian has a parameter m, initially `mask_start`. The Gaussian is rendered with opacity and
 //! scales multiplied by 1\[σ(m) > `min_mask`\], whose derivative is taken to be that of σ(m)
-//! (straight-through). `mask_weight` · mean σ(m) is added to the loss, so a mask falls unless the images
-//! need its Gaussian. m has the learning rate `mask_rate`. Clones and children of splits inherit the
+//! (straight-through). `mask_weight` · the mean of σ(m) over Gaussians is added to the loss, so a mask falls
+//! unless the images need its Gaussian. m has the learning rate `mask_rate`. Clones and children of splits inherit the
 //! parent's mask.
 //!
 //! **Pruning.** Gaussians with σ(m) ≤ `min_mask` are pruned at every growth step, every `mask_every` steps
@@ -122,7 +122,7 @@ impl Default for CompactParams {
 pub struct Compact {
     params: CompactParams,
     growth: Vanilla,
-    /// When to prune by mask, in addition to the growth steps.
+    /// The prunes by mask other than those at growth steps and at the last step.
     prune: Window,
     iterations: u32,
 }

@@ -11,7 +11,7 @@ use crate::registry::PolicyEntry;
 /// Runs [`Check::IsDocumented`].
 ///
 /// # Errors
-/// A report of all parameters whose row in the manual is missing or wrong.
+/// A report of all rows of the manual's table that are missing or wrong, or that describe no parameter.
 pub fn check_manual(entry: &PolicyEntry) -> Result<(), Report> {
     let manual = entry.manual();
     let table = manual.lines().skip_while(|line| !line.starts_with("| name | default |")).skip(2);
@@ -62,11 +62,11 @@ fn check_range(entry: &PolicyEntry, name: &str, default: &Value, range: &str) ->
         let set = Table::from_iter([(name.to_owned(), value.clone())]);
         entry.build(&set, &scene(10, 100)).map(drop)
     };
-    let inside = inside.iter().find_map(|value| {
+    let wrongly_refused = inside.iter().find_map(|value| {
         let error = build(value).err()?;
         Some(format!("`{name}` = {value} is in its range, but: {error}"))
     });
-    inside.or_else(|| {
+    wrongly_refused.or_else(|| {
         outside.iter().find_map(|value| match build(value) {
             Ok(()) => Some(format!("`{name}` = {value} is accepted, but its range is `{range}`")),
             Err(PolicyError::BadParameter { parameter, .. }) if parameter == name => None,
@@ -100,17 +100,17 @@ fn boundary_values(range: &str, default: &Value) -> Option<(Vec<Value>, Vec<Valu
         _ => Value::Float(x),
     };
     let (mut inside, mut outside) = (Vec::new(), Vec::new());
-    let mut end = |end: &str, is_excluded: bool, beyond: f64| {
-        let end: f64 = end.parse().ok()?;
+    let mut add_end = |text: &str, is_excluded: bool, beyond: f64| {
+        let end: f64 = text.parse().ok()?;
         if !is_excluded {
             inside.push(number(end));
         }
         outside.push(number(if is_excluded { end } else { end + beyond }));
         Some(())
     };
-    end(low, excludes_low, -1.0)?;
+    add_end(low, excludes_low, -1.0)?;
     if !high.is_empty() {
-        end(high, excludes(high), 1.0)?;
+        add_end(high, excludes(high), 1.0)?;
     }
     if default.is_float() {
         outside.extend([f64::NAN, f64::INFINITY].map(Value::Float));

@@ -12,8 +12,8 @@
 //!
 //! The suite builds the policy with its defaults and takes it through scripted runs. Models are empty, have
 //! one row, are full or have room, and some plans refuse all growth. Statistics, also those of auxiliary
-//! views, are plausible, zero, all equal, negative, infinite, NaN or a mixture. [`Check`] lists the
-//! properties that are checked:
+//! views, are plausible, zero, all equal, negative, extreme, infinite, NaN or a mixture. The suite checks these
+//! properties, which [`Check`] defines:
 //!
 //! - the budget holds, and at least one row is left;
 //! - the policy edits at least one of the models (some have thousands of rows, so that a small fraction is
@@ -127,7 +127,7 @@ impl Report {
         Self { policy, failures: Vec::new() }
     }
 
-    /// Keeps the first failure of each check.
+    /// Adds a failure, unless its check has failed before.
     fn add(&mut self, check: Check, reason: String) {
         if self.failures.iter().all(|(known, _)| *known != check) {
             self.failures.push((check, reason));
@@ -175,7 +175,7 @@ fn check_building(entry: &PolicyEntry, set: &Table, report: &mut Report) {
     for iterations in [1, 7, 600, 30_000, u32::MAX] {
         let scene = SceneInfo { iterations, ..scenarios::scene(10, 100) };
         if let Err(error) = entry.build(set, &scene) {
-            report.add(Check::Builds, format!("for {iterations} steps: {error}"));
+            report.add(Check::Builds, format!("in a run of {iterations} steps: {error}"));
         }
     }
     let parameters = entry.parameters();

@@ -22,7 +22,7 @@ type Failure = (Check, String);
 
 /// Runs a scenario with several copies of the policy: two as in training, one that is shown more than it
 /// declares, and two restored from states saved one third and two thirds of the way through the run. All must make
-/// the same plans. Returns true if any plan edited the model.
+/// the same plans; a copy that differs fails the check stored with it. Returns true if any plan edited the model.
 pub(super) fn run(entry: &PolicyEntry, set: &Table, scenario: &Scenario) -> Result<bool, Failure> {
     let scene = &scenario.scene;
     let build = || {
@@ -32,7 +32,7 @@ pub(super) fn run(entry: &PolicyEntry, set: &Table, scenario: &Scenario) -> Resu
     let mut policy = build()?;
     let mut copies: Vec<(Check, Box<dyn DensityPolicy>)> =
         vec![(Check::IsDeterministic, build()?), (Check::ReadsOnlyDeclared, build()?)];
-    rejects_foreign_state(&mut *build()?)?;
+    check_foreign_state(&mut *build()?)?;
     let needs = policy.needs(scene);
     check_needs(&*policy, &needs, scenario)?;
     if needs != policy.needs(scene) || needs != copies[0].1.needs(scene) {
@@ -76,7 +76,7 @@ fn check_needs(
         None => Ok(()),
         Some(step) => {
             let (cadence, longest) = (policy.cadence(step), needs.cadence);
-            Err(out_of_range(format!("at step {step} {cadence:?}, but {longest:?} was declared")))
+            Err(out_of_range(format!("at step {step}: {cadence:?}, but {longest:?} was declared")))
         }
     }
 }
@@ -107,7 +107,7 @@ fn run_event(
         let resolution = policy.resolution(step);
         (policy.cadence(step), terms, policy.noise(step, needs.noise), resolution)
     };
-    // Read before planning, which may change the policy's state.
+    // The schedule is read before planning, as a plan may change the policy's state.
     let expected = schedule(policy);
     observe(policy, step, rows, &views, &request, false)?;
     let ops = plan(policy, scenario, &event, needs, false)?;
@@ -123,7 +123,7 @@ fn run_event(
         observe(&mut **copy, step, rows, &views, &request, sees_all)?;
         let again = plan(&mut **copy, scenario, &event, needs, sees_all)?;
         if again != ops {
-            return Err((*check, format!("{ops:?}, but a copy planned {again:?}")));
+            return Err((*check, format!("it planned {ops:?}, but a copy {again:?}")));
         }
         if copy.save() != policy.save() {
             return Err(differs("saves a different state"));
@@ -145,8 +145,8 @@ fn observe(
         let columns = view.columns.iter();
         let columns = columns.filter(|(column, _)| sees_all || request.columns.contains(column));
         let columns: Vec<_> = columns.cloned().collect();
-        // With `sees_all`, a policy that requested no points is shown all of them; one that requested some gets only
-        // those.
+        // With `sees_all`, a policy that requested no points is shown all of them; one that requested some is
+        // shown no more than those.
         let max_points =
             if sees_all && request.points == 0 { usize::MAX } else { request.points as usize };
         let points = &view.points[..max_points.min(view.points.len())];
@@ -193,7 +193,7 @@ fn plan(
     }
     let ops = plan.compile();
     if (ops.rows_before, ops.budget) != (rows, budget) || ops.rows_after > budget {
-        let reason = format!("budget {budget}, but the plan was made for {ops:?}");
+        let reason = format!("given {rows} rows and budget {budget}, it planned {ops:?}");
         return Err((Check::KeepsPlan, reason));
     }
     if rows > 0 && ops.rows_after == 0 {
@@ -220,12 +220,12 @@ fn restored(
     Ok(copy)
 }
 
-fn rejects_foreign_state(policy: &mut dyn DensityPolicy) -> Result<(), Failure> {
+fn check_foreign_state(policy: &mut dyn DensityPolicy) -> Result<(), Failure> {
     let foreign = serde_json::json!({ "conformance": "not a state" });
     let reason = match catch_panic(|| policy.restore(foreign)) {
         Ok(Err(PolicyError::State(_))) => return Ok(()),
-        Ok(Err(error)) => format!("it was refused with the wrong error: {error}"),
-        Ok(Ok(())) => "it was accepted".to_owned(),
+        Ok(Err(error)) => format!("the state was refused with the wrong error: {error}"),
+        Ok(Ok(())) => "the state was accepted".to_owned(),
         Err(panic) => panic,
     };
     Err((Check::RejectsForeignState, reason))

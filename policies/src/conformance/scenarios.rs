@@ -65,7 +65,7 @@ pub(super) fn scene(initial_rows: usize, budget: usize) -> SceneInfo {
 pub(super) fn scenarios() -> Vec<Scenario> {
     let models = [
         ("an empty model", scene(0, 8), false),
-        ("one row at its budget", scene(1, 1), false),
+        ("one row and a budget of one", scene(1, 1), false),
         ("one row", scene(1, 16), false),
         ("a full model", scene(24, 24), false),
         ("a model with room", scene(30, 300), false),

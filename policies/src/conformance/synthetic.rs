@@ -38,7 +38,7 @@ pub(super) const PATTERNS: [Pattern; 11] = [
     Pattern::Changing,
 ];
 
-/// A value that follows `pattern`, from four random words.
+/// A value that follows `pattern`, from four random words; `plausible` maps u in [0, 1) to a plausible value.
 fn value(pattern: Pattern, bits: [u32; 4], plausible: impl Fn(f32) -> f32) -> f32 {
     let u = (bits[0] >> 9) as f32 / 8_388_608.0;
     match pattern {
@@ -51,7 +51,7 @@ fn value(pattern: Pattern, bits: [u32; 4], plausible: impl Fn(f32) -> f32) -> f3
         Pattern::Infinite => f32::INFINITY,
         Pattern::MinusInfinite => f32::NEG_INFINITY,
         Pattern::Nan => f32::NAN,
-        // Half of the values are plausible, so that policies act at all.
+        // Half of the values are plausible, so that policies act at all; the others follow any earlier pattern.
         Pattern::Mixture => {
             let pattern =
                 if bits[1].is_multiple_of(2) { 0 } else { bits[2] as usize % (PATTERNS.len() - 2) };
@@ -128,8 +128,8 @@ impl Model {
         let all = fill(Signal::ALL.into());
         let capacity = needs.candidates.map_or(5, |request| request.capacity);
         for index in 0..capacity.saturating_sub(self.candidates.len()).min(5) as u32 {
-            let number = |part: u32, scale: f32| {
-                let bits = rng.bits(index, Purpose::Noise, 100 + part);
+            let number = |component: u32, scale: f32| {
+                let bits = rng.bits(index, Purpose::Noise, 100 + component);
                 value(pattern, bits, |u| u) * scale
             };
             self.candidates.push(candidate(number));
@@ -146,12 +146,12 @@ impl Model {
         request: &AuxRequest,
     ) -> View {
         let rng = PolicyRng::new(11 + u64::from(view), step);
-        let number = |row: u32, part: u32, scale: f32| {
-            value(pattern, rng.bits(row, Purpose::Noise, 200 + part), |u| u) * scale
+        let number = |row: u32, counter: u32, scale: f32| {
+            value(pattern, rng.bits(row, Purpose::Noise, 200 + counter), |u| u) * scale
         };
-        let columns = (0..).zip(AuxColumn::ALL).map(|(part, column)| {
+        let columns = (0..).zip(AuxColumn::ALL).map(|(counter, column)| {
             let numbers = (0..self.rows as u32).map(|row| {
-                let bits = rng.bits(row, Purpose::Noise, 200 + part);
+                let bits = rng.bits(row, Purpose::Noise, 200 + counter);
                 value(pattern, bits, |u| (40.0 * u).floor())
             });
             (column, numbers.collect())
@@ -161,7 +161,7 @@ impl Model {
             loss: number(0, 30, 1.0),
             columns: columns.collect(),
             points: points
-                .map(|index| candidate(|part, scale| number(index, 20 + part, scale)))
+                .map(|index| candidate(|component, scale| number(index, 20 + component, scale)))
                 .collect(),
         }
     }
@@ -177,8 +177,8 @@ impl Model {
 /// A candidate whose components are `number(index of the component, scale)`.
 fn candidate(number: impl Fn(u32, f32) -> f32) -> Candidate {
     Candidate {
-        position: [0, 1, 2].map(|part| number(part, 1.0)),
-        colour: [3, 4, 5].map(|part| number(part, 1.0)),
+        position: [0, 1, 2].map(|index| number(index, 1.0)),
+        colour: [3, 4, 5].map(|index| number(index, 1.0)),
         pixel_size: number(6, 0.01),
         error: number(7, 1.0),
     }

@@ -1,4 +1,4 @@
-//! Tests that the registered policies conform, and that a policy with any one fault is caught.
+//! Tests that the registered policies conform, and that a policy with any of the faults below is caught.
 //!
 //! One file, because one policy can have each of the faults.
 
@@ -53,7 +53,7 @@ enum Fault {
     HasUndeclaredCadence,
     HasNanTermsLate,
     ShrinksImagesTooFar,
-    /// Depends on state that it does not save.
+    /// Shrinks images, depending on state that it does not save.
     ShrinksImagesUnsaved,
     NeverEdits,
     /// Prunes one row in a thousand, chosen by the system's clock.
@@ -370,7 +370,7 @@ impl DensityPolicy for Unbuildable {
 fn building_is_checked() {
     let entry = PolicyEntry::new::<Unbuildable>("x", "", "", "", ("tests.rs", 2));
     let failures = check_policy(&entry).unwrap_err().failures;
-    assert_eq!(failures, [(Check::Builds, "for 7 steps: not seven".to_owned())]);
+    assert_eq!(failures, [(Check::Builds, "in a run of 7 steps: not seven".to_owned())]);
 }
 
 #[test]
@@ -383,15 +383,15 @@ fn manuals_are_checked() {
     let with = |rows: &str| -> &'static str { format!("{head}{rows}").leak() };
     assert_eq!(manual(with("//! | threshold | 0 | | | meaning |\n//!\n")), Ok(()));
     assert_eq!(manual(""), Err("`threshold` is missing".to_owned()));
-    let wrong =
+    let mistaken =
         manual(with("//! | threshold | 0.1 | | | meaning |\n//! | ghost | 1 | | | meaning |\n"));
     let message = "`threshold` has the default 0.0, not 0.1, `ghost` is not a parameter";
-    assert_eq!(wrong, Err(message.to_owned()));
+    assert_eq!(mistaken, Err(message.to_owned()));
     let short = manual(with("//! | threshold | 0 | meaning |\n"));
     assert_eq!(short, Err("the row of `threshold` has 3 cells instead of 5".to_owned()));
     let range = |range| manual(with(&format!("//! | threshold | 0 | {range} | | meaning |\n")));
     assert_eq!([range("0 to 1"), range(">= 0"), range("")], [Ok(()), Ok(()), Ok(())]);
-    for (wrong, value) in [
+    for (wrong, expected) in [
         ("0 to 2", "2.0 is in its range"),
         (">= -1", "-1.0 is in its range"),
         ("> 0", "0.0 is accepted"),
@@ -400,6 +400,6 @@ fn manuals_are_checked() {
         ("about 1", "not in a known form"),
     ] {
         let message = range(wrong).unwrap_err();
-        assert!(message.contains(value), "{wrong}: {message}");
+        assert!(message.contains(expected), "{wrong}: {message}");
     }
 }

@@ -14,8 +14,8 @@ impl Diet {
         if every == 0 || from >= until {
             return None;
         }
-        // The number of pixels that a model at the budget collects in one interval, but at most one per row of the
-        // budget.
+        // The number of pixels collected in one interval if the model is at the budget, but at most one per row of
+        // the budget.
         let steps = every.min(until - from) as usize;
         let per_step = (scene.budget / self.params.rows_per_candidate as usize).max(1);
         let capacity = steps.saturating_mul(per_step).min(scene.budget).max(1);
@@ -31,7 +31,7 @@ impl Diet {
         })
     }
 
-    /// Appends rows at the candidates with the largest errors, evicting other rows to make room.
+    /// Appends rows at the candidates with the largest errors, evicting rows that are not `exempt` to make room.
     pub(super) fn insert(
         &self,
         now: &Snapshot<'_>,

@@ -12,12 +12,12 @@
 //! **Growth**, every `grow_every` steps between `grow_from` and `grow_until`. Candidates are
 //! Gaussians with g >= `tau`, where g = g_p + `colour_weight` · g_c. g_p and g_c are the norms of the
 //! loss gradient with respect to the projected mean (NDC) and to the colour, averaged over the views
-//! that saw the Gaussian; a view at a depth below `full_depth` is weighted by (depth / `full_depth`)² (as in
-//! *Pixel-GS*, Zhang et al. 2024). Gaussians below `min_opacity` are pruned and are never candidates. If
-//! there are more candidates than room, the least important Gaussians are evicted: at most `rho` · budget
-//! over the whole run, an equal part at each growth step. Then the candidates with the largest g are
-//! densified: small ones (up to `small` · scene extent) are cloned, the others split in two (`split`).
-//! The remaining candidates are counted as denied, and the gradient statistics are reset.
+//! that saw the Gaussian; a view in which its depth is below `full_depth` is weighted by (depth /
+//! `full_depth`)² (as in *Pixel-GS*, Zhang et al. 2024). Gaussians below `min_opacity` are pruned and are never
+//! candidates. If there are more candidates than room, the least important Gaussians are evicted: at most `rho`
+//! · budget over the whole run, an equal number at each growth step. Then the candidates with the largest g are
+//! densified: small ones (up to `small` · scene extent) are cloned, the others split in two (`split`). The
+//! remaining candidates are counted as denied, and the gradient statistics are reset.
 //!
 //! **Eviction** prunes the least important Gaussians that are not candidates. Importance is the
 //! largest blend weight α·T over all pixels of the views chosen by `importance`. New Gaussians are
@@ -27,8 +27,8 @@
 //! **Compensation**, every `insert_every` steps between `compensate_from` and `compensate_until`.
 //! Within this window each step collects the pixels of its view with the largest errors, one per
 //! `rows_per_candidate` Gaussians, together with the surface points seen there. At each insertion the worst
-//! pixels collected since the last one become new Gaussians with the ground-truth colour: at most
-//! `rho_c` · budget over the whole run, an equal part at each insertion. Where there is no room, the
+//! pixels collected since the previous one become new Gaussians with the ground-truth colour: at most
+//! `rho_c` · budget over the whole run, an equal number at each insertion. Where there is no room, the
 //! least important Gaussians are evicted. The list of collected pixels is then cleared.
 //!
 //! **Pruning**, every `prune_every` steps until growth and compensation have ended, evicts the Gaussians in excess
@@ -40,7 +40,7 @@
 //! pruning by size (0.1 after step `max_scale_from` in paper and code) can remove an entire wall, which
 //! is then never replaced. docs/studies has the figures.
 //!
-//! Each event is one plan in which pruning frees slots before new Gaussians take them, so the budget holds
+//! Each event is one plan in which Gaussians are pruned before new ones take their places, so the budget holds
 //! at all times. The published code exceeds it between insertion and the next pruning; this is not
 //! reproduced. Opacities are never reset. The published settings also use a learning rate of 0.025 for
 //! opacities (`--lr opacity=0.025`).
@@ -54,8 +54,8 @@
 //!   - `random`: two samples of the parent, with scales divided by `split_factor`, as in `vanilla`.
 //!   - `long-axis`: two halves along the parent's longest axis that keep its two ends, with `child_opacity`
 //!     times the parent's opacity, as in `igs`. With d = `split_share` they are placed at ±3d standard
-//!     deviations; their longest axis is 1 − d times the parent's, the others √(1 − d²).
-//! - `shift`: the offset of a clone from its parent. Σ sums over the views since the last growth step, dL/dμ is
+//!     deviations; their longest axis is 1 − d times the parent's, the others √(1 − d²) times.
+//! - `shift`: the offset of a clone from its parent. Below, Σ sums over the views since the last growth step, dL/dμ is
 //!   the loss gradient with respect to the mean, s the parent's largest standard deviation. Splits
 //!   are not shifted.
 //!   - `descent`: −`kappa` · s · Σ dL/dμ / Σ |dL/dμ|: against the gradient, by at most `kappa` · s, and by
@@ -113,8 +113,8 @@
 //! | shift | "descent" | descent, paper, code, none | | offset of clones |
 //! | kappa | 0.1 | >= 0 | standard deviations | longest shift of `descent` |
 //! | clone_opacity | "unchanged" | unchanged, conserve | | opacity of clones and their parents |
-//! | min_opacity | 0.005 | 0 to 1 | | Gaussians below this opacity are dead |
-//! | max_scale | 0.0 | >= 0 | scene extent | Gaussians above this size are dead; 0: no limit |
+//! | min_opacity | 0.005 | 0 to 1 | | Gaussians below this opacity are pruned at growth steps |
+//! | max_scale | 0.0 | >= 0 | scene extent | Gaussians above this size are pruned at growth steps; 0: no limit |
 //! | max_scale_from | 3000 | >= 0 | step | start of pruning by size (exclusive) |
 //! | importance | "epochs" | epochs, fresh | | views in which importance is measured |
 //! | fresh_views | 100 | >= 1 | views | random views per event for `fresh`; all if there are fewer |
@@ -187,10 +187,10 @@ pub struct Diet {
     insert: Window,
     /// Rows younger than this are protected `[steps]`.
     protected_age: f32,
-    /// Surface points for the current re-initialisation. Not saved, as the same event uses and clears them.
+    /// Surface points for the current re-initialisation. Not saved, as they are collected and used in one event.
     surface: Vec<Candidate>,
-    /// Largest blend weight of each row in the auxiliary views of the current event. Not saved, as the same event
-    /// uses and clears them.
+    /// Largest blend weight of each row in the auxiliary views of the current event. Not saved, as they are
+    /// collected and used in one event.
     weight_max: Vec<f32>,
 }
 

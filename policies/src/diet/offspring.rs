@@ -50,7 +50,7 @@ impl Diet {
             }
         };
         let shift = sum.map(|v| factor * v);
-        // 0/0 where no view saw the row.
+        // Not finite if no view saw the row.
         Ok(if shift.iter().all(|v| v.is_finite()) { shift } else { [0.0; 3] })
     }
 }

@@ -72,19 +72,19 @@ fn at_the_budget_the_least_important_rows_are_replaced() {
 #[test]
 fn event_quotas_add_up_to_the_share() {
     let window = Window { from: 500, until: 10_000, every: 100 };
-    let parts = |share: f64, window: Window, budget: usize| -> Vec<usize> {
+    let quotas = |share: f64, window: Window, budget: usize| -> Vec<usize> {
         let steps = (1..=30_000).filter(|&step| window.is_due(step));
         steps.map(|step| event_quota(share, window, step, budget)).collect()
     };
-    let quarter = parts(0.25, window, 200_000);
+    let quarter = quotas(0.25, window, 200_000);
     assert_eq!((quarter.len(), quarter.iter().sum()), (94, 50_000));
-    assert!(quarter.iter().all(|part| (531..=532).contains(part)));
+    assert!(quarter.iter().all(|quota| (531..=532).contains(quota)));
     // Less than one row per event.
-    assert_eq!(parts(0.25, window, 100).iter().sum::<usize>(), 25);
+    assert_eq!(quotas(0.25, window, 100).iter().sum::<usize>(), 25);
     // As computed, 0.29 · 100 is just below 29; it counts as 29. 0.1 · 29 = 2.9 counts as 2.
     assert_eq!((share_of_budget(0.29, 100), share_of_budget(0.1, 29)), (29, 2));
     let once = Window { from: 500, until: 601, every: 100 };
-    assert_eq!((parts(0.29, once, 100), parts(0.1, once, 29)), (vec![29], vec![2]));
+    assert_eq!((quotas(0.29, once, 100), quotas(0.1, once, 29)), (vec![29], vec![2]));
     assert_eq!(event_quota(1.0, window, 650, 100), 0);
 }
 
@@ -101,7 +101,7 @@ fn pruned_slots_and_room_are_used_before_rows_are_evicted() {
     assert_eq!(done.cloned, [14, 13, 12, 11]);
     assert_eq!(done.ops.counts.denied, 1);
     assert_eq!(done.ops.rows_after, 20);
-    // With room for all, none is evicted.
+    // With room for all five candidates, no row is evicted.
     let roomy = run(&Event { budget: 23, ..event }, "");
     assert_eq!((roomy.pruned, roomy.cloned.len()), (vec![7], 5));
 }
@@ -146,7 +146,7 @@ fn importance_may_be_measured_in_fresh_views() {
 }
 
 #[test]
-fn fresh_views_are_rendered_where_rows_may_be_evicted() {
+fn fresh_views_are_rendered_if_rows_may_be_evicted() {
     let scene = Event::new(1, 1, 100).scene;
     let policy = build("diet", "importance = \"fresh\"\nrho_c = 0.45", &scene);
     let wants = |step, rows| policy.aux_views(step, rows, 100) == 100;
@@ -231,10 +231,10 @@ fn large_rows_split_and_small_ones_are_cloned() {
         .with(Signal::ScreenGradient, &[2.0, 1.0])
         .with(Signal::ScaleMax, &[0.101, 0.1]);
     let offspring = |set: &str| -> Vec<Offspring> { run(&event, set).offspring() };
-    let [random_split, clone] = offspring("split = \"random\"")[..] else { panic!("two families") };
+    let [random_split, clone] = offspring("split = \"random\"")[..] else { panic!("not a pair") };
     assert_eq!((random_split, clone), (split_by(1.6), clone_at([0.0; 3])));
     assert_eq!(random_split.scale, ScaleRule::Uniform(0.625));
-    let [halves, clone] = offspring("")[..] else { panic!("two families") };
+    let [halves, clone] = offspring("")[..] else { panic!("not a pair") };
     assert_eq!((halves, clone), (split_long_axis(0.45, 0.6), clone_at([0.0; 3])));
     let other = offspring("split_share = 0.3\nchild_opacity = 0.8")[0];
     assert_eq!(other, split_long_axis(0.3, 0.8));
@@ -249,7 +249,7 @@ fn a_conserving_clone_shares_its_opacity() {
     let offspring = done.offspring()[0];
     assert_eq!((offspring.parent, offspring.siblings()), (ParentFate::BecomesChild, 2));
     assert_eq!(offspring.opacity, OpacityRule::Conserved);
-    // o′ = 0.5, so 0.75 / (1 − 0.25/√2).
+    // o′ = 0.5, so the factor is 0.75 / (1 − 0.25/√2).
     let ScaleRule::Uniform(scale) = offspring.scale else { panic!("{offspring:?}") };
     assert!((scale - 0.911_053).abs() < 1e-5, "{scale}");
     // The extremes given by Kheradmand et al.: faint Gaussians hardly shrink, opaque ones do.
@@ -259,7 +259,7 @@ fn a_conserving_clone_shares_its_opacity() {
 }
 
 #[test]
-fn at_the_budget_with_nothing_to_do_the_plan_is_empty() {
+fn at_the_budget_without_candidates_no_row_is_edited() {
     let pruning = run(&event(650, 20, 20), "");
     assert!(pruning.ops.is_empty() && pruning.ops.counts == EditCounts::default());
     assert_eq!(pruning.ops.cause, "");
@@ -279,7 +279,7 @@ fn a_model_above_the_budget_is_pruned_to_it() {
 
 #[test]
 fn rows_pruned_for_the_budget_do_not_grow() {
-    // Two of six rows are too many; candidate 0 is one of them, so one eviction is enough.
+    // Two of six rows are too many; candidate 0 is one of them, so only candidate 5 needs an eviction.
     let event = event(600, 6, 4).with(Signal::ScreenGradient, &gradient_sums(6, &[0, 5]));
     let done = run(&event, "rho = 47");
     assert_eq!(done.pruned, [0, 1, 2]);
@@ -288,7 +288,7 @@ fn rows_pruned_for_the_budget_do_not_grow() {
 
 #[test]
 fn the_worst_pixels_become_rows() {
-    // With a budget of 40, two rows are inserted per event; from 39 rows, one is evicted.
+    // With a budget of 40, two rows are inserted per event; as there are 39 rows, one is evicted.
     let mut event = event(10_500, 39, 40);
     event.candidates = vec![candidate(0.1, 0.01), candidate(0.3, 0.02), candidate(0.2, 0.03)];
     let done = run(&event, "rho_c = 0.45");
@@ -351,7 +351,7 @@ fn schedules_match_the_paper() {
     let prune = due("grow_every = 0\ninsert_every = 0", 30_000);
     assert_eq!((prune.len(), prune[0], prune.last()), (289, 550, Some(&14_950)));
     let insert = due("prune_every = 0\ngrow_every = 0", 3000);
-    // A tenth of the run, but intervals stop shrinking at 100 steps.
+    // In a run of a tenth of the length, the interval would be 50 steps, but it does not shrink below 100.
     assert_eq!(insert, (1100..1500).step_by(100).collect::<Vec<_>>());
 }
 
@@ -419,7 +419,7 @@ fn the_model_is_replaced_by_surface_points() {
     assert_eq!(done.ops.counts, EditCounts { removed: 9, added: 8, updated: 0, denied: 0 });
     assert_eq!((done.ops.rows_after, done.ops.cause.as_str()), (8, "reinit"));
     assert!(!done.ops.reset_signals.is_empty() && done.ops.reset_candidates);
-    // Distances to the three nearest neighbours: of point 0: 1, 2, 3; of point 1: 1, 1, 2.
+    // The three nearest neighbours of point 0 are at distances 1, 2 and 3; those of point 1 at 1, 1 and 2.
     let seeds: Vec<Seed> = done.ops.seeds.iter().map(|(_, seed)| *seed).collect();
     let sizes = [(14.0_f32 / 3.0).sqrt(), 2.0_f32.sqrt()];
     for (seed, size) in seeds.iter().zip(sizes) {

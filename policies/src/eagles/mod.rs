@@ -41,7 +41,7 @@
 //! - Images are downscaled by averaging over each pixel's area, whereas the published code interpolates
 //!   between four pixels and skips the others. They are never downscaled below 16 pixels a side.
 //! - The code's own defaults are a different configuration: `prune_every` = 3000, `prune_share` = 0.05,
-//!   `prune_until` = 24000, growth as in `vanilla`, and full-size images (`whole_from` = 0).
+//!   `prune_until` = 24000, `vanilla`'s defaults for growth, and full-size images (`whole_from` = 0).
 //! - The last Gaussian is never pruned.
 //!
 //! ## Parameters

@@ -14,8 +14,9 @@
 //! respect to the projected mean (NDC), with absolute values summed over pixels, averaged over the
 //! views that saw the Gaussian. Candidates are drawn without replacement, in proportion to their edge
 //! scores, until the curve is reached. To compute the scores, `views` random training views are rendered;
-//! in each, a Gaussian's score is the sum of the edge map over the pixels that it is blended into, divided
-//! by the mean of all positive sums of the view; the scores of all views are added. The first growth
+//! in each, a Gaussian's score is the sum of the edges (the Laplacian of the photograph's luma, scaled to 0..1)
+//! over the pixels that it is blended into, divided by the mean of all positive sums of the view; the scores of
+//! all views are added. The first growth
 //! step after a recovery prune uses all views. After `final_from` the gradient itself is the score, no view
 //! is rendered, and `tau` is divided by `final_divisor`.
 //!
@@ -47,7 +48,7 @@
 //!   in a run of any length.
 //! - The published code splits, then prunes. A plan has one edit per Gaussian: if a Gaussian is drawn and
 //!   its children would be pruned in the same event, it is pruned itself. The result is the same.
-//! - `recover` is a number of optimiser steps, so it does not scale with the length of the run; it is at most
+//! - `recover` is a number of optimiser steps, so it does not scale with the length of the run; it is limited to
 //!   half the interval of resets, so that the prune comes before the next reset.
 //! - The published code averages gradients from step 500 on; here the first growth step averages over
 //!   all steps before it.
@@ -89,8 +90,8 @@
 //! | sh_rest | 0.00025 | > 0 | | learning rate of SH bands 1–3 |
 //!
 //! Defaults in steps are for a run of 30,000 iterations and scale with its length; intervals
-//! (`…_every`) do not shrink below 100 steps. `recover` does not scale; `sum` and `sum_more` scale even if
-//! they are set, unless `sums` is `"fixed"`.
+//! (`…_every`) do not shrink below 100 steps. `recover` does not scale. Values set by the user do not scale,
+//! except `sum` and `sum_more`, unless `sums` is `"fixed"`.
 
 use crate::adc::{OpacityResets, PruneLimits, Window, mean_over_views, spare_one, split_long_axis};
 use crate::parameters::StepParameter::{self, Interval, Step};
@@ -310,8 +311,8 @@ impl Igs {
         let tau = (self.params.tau / divisor) as f32;
         let weight = |row: usize| {
             let is_candidate = gradient[row] >= tau && !limits.exceeded(opacity[row], 0.0);
-            let score = if is_final { Some(&gradient[row]) } else { score.rows.get(row) };
-            if is_candidate { score.copied().unwrap_or(0.0) } else { 0.0 }
+            let weight = if is_final { Some(&gradient[row]) } else { score.rows.get(row) };
+            if is_candidate { weight.copied().unwrap_or(0.0) } else { 0.0 }
         };
         let weights: Vec<f32> = (0..now.rows()).map(weight).collect();
         let rows = opacity.iter().filter(|&&opacity| !limits.exceeded(opacity, 0.0)).count();

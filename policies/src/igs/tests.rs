@@ -24,15 +24,15 @@ fn view(edges: &[f32]) -> View {
 
 #[test]
 fn growth_follows_the_square_root() {
-    // 140 · √(3500/14000) = 70 at step 4000; √((600 − 500)/14000) = 0.0845.
+    // 140 · √(3500/14000) = 70 at step 4000.
     let event = event(4000, &[1.0; 60], 140);
     let done = run(&event, "");
     assert_eq!((done.ops.rows_after, done.split.len()), (70, 10));
     assert_eq!(done.ops.cause, "grow");
     assert!(!done.ops.reset_signals.is_empty());
     let after = |step| run(&Event { step, ..event.clone() }, "").ops.rows_after;
-    // A curve below the current number prunes nothing. From 14,500 on it is at the budget of 140, but each of the 60
-    // rows is split only once.
+    // A curve below the current number of rows prunes nothing. From step 14,500 on it is at the budget of 140, but
+    // each of the 60 rows is split only once.
     assert_eq!([after(600), after(2000), after(14_500), after(14_900)], [60, 60, 120, 120]);
     let low = Event { budget: 100, ..event.clone() };
     assert_eq!(run(&Event { step: 14_500, ..low }, "").ops.rows_after, 100);
@@ -136,7 +136,7 @@ fn rows_are_split_before_they_are_pruned() {
 }
 
 #[test]
-fn the_last_growth_step_prunes_nothing() {
+fn the_last_growth_step_prunes_no_faint_rows() {
     let pruned = |step, set: &str| {
         let faint = event(step, &[0.0; 2], 9).with(Signal::Opacity, &[0.5, 0.004]);
         run(&faint.with_all(Signal::ScreenGradientAbs, 0.0), set).pruned
@@ -146,7 +146,7 @@ fn the_last_growth_step_prunes_nothing() {
     // In a shorter run, of 7,000 iterations, growth ends before step 3,500.
     let short = "grow_until = 3500\ngrow_from = 117";
     assert_eq!([pruned(3_300, short), pruned(3_400, short)], [vec![1], vec![]]);
-    // A split row with children of 0.6 · 0.004 is kept, too. NaN is still pruned.
+    // A row whose children have an opacity of 0.6 · 0.004 is split, too. The row with NaN is still pruned.
     let split = event(14_900, &[1.0; 2], 9).with(Signal::Opacity, &[0.004, f32::NAN]);
     let done = run(&split, "");
     assert_eq!((done.pruned, done.split), (vec![1], vec![0]));
@@ -158,8 +158,8 @@ fn the_budget_holds_while_rows_are_split_and_pruned() {
     let full = event(14_600, &[1.0; 4], 4).with(Signal::Opacity, &[0.5, 0.004, 0.5, 0.5]);
     let done = run(&full, "");
     assert_eq!((&done.pruned[..], done.split.len(), done.ops.rows_after), (&[1][..], 0, 3));
-    // Room for one: one of the four rows is drawn. If it is row 1, nothing is split, as its children would be too faint.
-    // Row 1 is pruned in any case.
+    // Room for one: one of the four rows is drawn. If it is row 1, nothing is split, as its children would be too
+    // faint. Row 1 is pruned in any case.
     let room = run(&Event { budget: 5, ..full.clone() }, "");
     assert_eq!((room.pruned, room.ops.counts.denied), (vec![1], 0));
     assert!(room.split.len() <= 1);
@@ -202,7 +202,7 @@ fn recovery_prunes_take_their_share_of_the_rows_after_the_splits() {
     let done = run(&event, "");
     assert_eq!((done.pruned, done.ops.rows_after), (vec![2], 7));
     // Rank 0.3 · 7 = 2.1: values below 0.2 are pruned, among them both children of row 1, so row 1 is pruned.
-    // (Rank 0.28 · 7 = 1.96 gives 0.06. If children counted once, 0.28 · 5 = 1.4 would give 0.2.)
+    // (Rank 0.28 · 7 = 1.96 gives 0.06. If a split row counted once, rank 0.28 · 5 = 1.4 would give 0.2.)
     assert_eq!(run(&event, "recovery_share = 0.28").pruned, [2]);
     let more = run(&event, "recovery_share = 0.3");
     assert_eq!((more.pruned, more.split), (vec![1, 2], vec![4]));
@@ -297,15 +297,15 @@ fn optimiser_steps(set: &str, iterations: u32) -> [usize; 2] {
 
 #[test]
 fn the_number_of_optimiser_steps_is_kept_in_short_runs() {
-    // 7500/5 and 7500/20; a run twice as long sums over 10 and 40 iterations.
+    // 7500/5 and 7500/20 steps; a run twice as long sums over 10 and 40 iterations.
     assert_eq!(optimiser_steps("", 30_000), [1500, 375]);
     assert_eq!(optimiser_steps("", 60_000), [1500, 375]);
-    // 7,000: 5 · 7/30 = 1.17, 20 · 7/30 = 4.67, so 1 and 5: 1750 and 350.
+    // A run of 7,000 sums over 5 · 7/30 = 1.17 and 20 · 7/30 = 4.67 iterations, rounded to 1 and 5.
     assert_eq!(optimiser_steps("", 7000), [1750, 350]);
     // 20 · 2/30 = 1.33 becomes 1: an optimiser step at every iteration.
     assert_eq!(optimiser_steps("", 2000), [500, 500]);
     assert_eq!(optimiser_steps("", 4), [1, 1]);
-    // As published: 1,750/5, and the multiples of 20 from 5,260 to 7,000.
+    // As published: 1,750/5 steps, and one at each multiple of 20 from 5,260 to 7,000.
     let fixed = "sums = \"fixed\"";
     assert_eq!(optimiser_steps(fixed, 30_000), [1500, 375]);
     assert_eq!(optimiser_steps(fixed, 7000), [350, 88]);

@@ -31,9 +31,9 @@ pub struct LightGaussianParams {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Schedule {
-    /// Two prunes.
+    /// Two prunes, of `first_share` and `second_share`.
     Twice,
-    /// One prune, of more rows.
+    /// One prune, of `once_share`.
     Once,
 }
 
@@ -47,7 +47,7 @@ pub enum Hit {
     BlendWeight,
 }
 
-/// The volume in the significance.
+/// The volume of a row in its significance.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Volume {

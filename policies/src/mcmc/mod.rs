@@ -236,8 +236,8 @@ impl DensityPolicy for Mcmc {
             plan.cause("grow");
         }
         plan.prune_all(dead);
-        for (row, copies) in with_replacement(&weights, copies.min(plan.room()), rng) {
-            let _ = plan.grow(row, self.copies(opacity[row as usize], copies));
+        for (row, count) in with_replacement(&weights, copies.min(plan.room()), rng) {
+            let _ = plan.grow(row, self.copies(opacity[row as usize], count));
         }
         Ok(())
     }
@@ -262,7 +262,7 @@ impl Mcmc {
         let members = copies.saturating_add(1);
         let counted = members.min(self.params.most_shares);
         let min_opacity = self.params.min_opacity;
-        let (share, scale) = share(f64::from(opacity), counted, min_opacity);
+        let (share, scale) = divide_opacity(f64::from(opacity), counted, min_opacity);
         let is_exact = counted == members && share > min_opacity;
         Offspring {
             children: copies,
@@ -275,13 +275,13 @@ impl Mcmc {
     }
 }
 
-/// The opacity, at least `least`, of each of `members` equal rows that replace one of opacity
+/// The opacity, at least `min_opacity`, of each of `members` equal rows that replace one of opacity
 /// `opacity`, and the factor on their standard deviations.
-fn share(opacity: f64, members: u32, least: f64) -> (f64, f64) {
+fn divide_opacity(opacity: f64, members: u32, min_opacity: f64) -> (f64, f64) {
     // Just below 1, also as an f32.
-    let most = 1.0 - f64::from(f32::EPSILON);
-    let opacity = opacity.clamp(0.0, most);
-    let share = (1.0 - (1.0 - opacity).powf(1.0 / f64::from(members))).clamp(least, most);
+    let max = 1.0 - f64::from(f32::EPSILON);
+    let opacity = opacity.clamp(0.0, max);
+    let share = (1.0 - (1.0 - opacity).powf(1.0 / f64::from(members))).clamp(min_opacity, max);
     let (mut sum, mut binomial, mut power) = (0.0, 1.0, -1.0);
     for k in 1..=members {
         binomial *= f64::from(members - k + 1) / f64::from(k);

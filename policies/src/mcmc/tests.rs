@@ -29,7 +29,7 @@ fn denominator(share: f64, members: u32) -> f64 {
 fn shares_conserve_opacity() {
     for opacity in [0.01, 0.3, 0.75, 0.99] {
         for members in [2, 3, 7, 51] {
-            let (share, scale) = share(opacity, members, 1e-9);
+            let (share, scale) = divide_opacity(opacity, members, 1e-9);
             let together = 1.0 - (1.0 - share).powi(members as i32);
             assert!((together / opacity - 1.0).abs() < 1e-12, "{opacity} {members}: {together}");
             let expected = opacity / denominator(share, members);
@@ -41,17 +41,17 @@ fn shares_conserve_opacity() {
 #[test]
 fn two_shares_match_values_worked_out_by_hand() {
     // o = 0.75: o′ = 0.5, 0.75/(1 − 0.25/√2) = 0.911053.
-    let (half, scale) = share(0.75, 2, 0.005);
+    let (half, scale) = divide_opacity(0.75, 2, 0.005);
     assert!((half - 0.5).abs() < 1e-12 && (scale - 0.911_053).abs() < 1e-6, "{half} {scale}");
     // Scale factors given beside the formula in the paper: 0.996 at opacity 0.05, 0.81 at 0.99.
-    assert!((share(0.05, 2, 0.005).1 - 0.996).abs() < 1e-3);
-    assert!((share(0.99, 2, 0.005).1 - 0.81).abs() < 5e-3);
+    assert!((divide_opacity(0.05, 2, 0.005).1 - 0.996).abs() < 1e-3);
+    assert!((divide_opacity(0.99, 2, 0.005).1 - 0.81).abs() < 5e-3);
     // Clamped from below: 1 − 0.994^½ = 0.003 becomes 0.005.
-    let (least, scale) = share(0.006, 2, 0.005);
+    let (clamped, scale) = divide_opacity(0.006, 2, 0.005);
     let by_hand = 0.006 / (0.01 - 0.005 * 0.005 / 2.0_f64.sqrt());
-    assert!((least - 0.005).abs() < 1e-12 && (scale - by_hand).abs() < 1e-9);
-    let (most, scale) = share(1.0, 2, 0.005);
-    assert!(most < 1.0 && scale.is_finite());
+    assert!((clamped - 0.005).abs() < 1e-12 && (scale - by_hand).abs() < 1e-9);
+    let (largest, scale) = divide_opacity(1.0, 2, 0.005);
+    assert!(largest < 1.0 && scale.is_finite());
 }
 
 #[test]
@@ -64,7 +64,7 @@ fn the_dead_are_relocated_to_the_only_living_row() {
     assert_eq!(family.placement, Placement::Offset([0.0; 3]));
     assert_eq!(family.opacity, OpacityRule::Conserved);
     let ScaleRule::Uniform(scale) = family.scale else { panic!("{family:?}") };
-    assert!((f64::from(scale) - share(0.5, 4, 0.005).1).abs() < 1e-6);
+    assert!((f64::from(scale) - divide_opacity(0.5, 4, 0.005).1).abs() < 1e-6);
     assert_eq!(done.ops.counts, EditCounts { removed: 3, added: 3, updated: 1, denied: 0 });
     assert_eq!((done.ops.rows_after, done.ops.cause.as_str()), (4, "relocate"));
     // A row of opacity 0.0051 is alive.
@@ -166,7 +166,7 @@ fn opaque_rows_are_drawn_more_often() {
         *copies += done.ops.offspring(family).children;
     }
     assert_eq!(faint + strong, 2000);
-    // 400 of 2000, within five standard deviations (18 each).
+    // 400 of the 2000 copies, within five standard deviations (18 each).
     assert!((310..490).contains(&faint), "{faint}");
 }
 
@@ -176,7 +176,7 @@ fn the_number_of_copies_is_capped_within_the_formulas_only() {
     opacity[7] = 0.5;
     let family = run(&event(&opacity, 80), "").offspring()[0];
     assert_eq!(family.children, 79);
-    let (share, scale) = share(0.5, 51, 0.005);
+    let (share, scale) = divide_opacity(0.5, 51, 0.005);
     assert_eq!(family.opacity, OpacityRule::Set(share as f32));
     assert_eq!(family.scale, ScaleRule::Uniform(scale as f32));
 }

@@ -18,21 +18,20 @@
 //! number, without a gradient threshold. By default the curve extends beyond the last event.
 //!
 //! **Turnover.** Each event also replaces the Gaussians whose importance is below `replaceable` times the
-//! median, except newborns. Over the whole run it replaces at least `rho` · F Gaussians, even if fewer are
-//! below this limit, and at most `most_rho` · F, an equal part at each event. While the model is below the
-//! budget, the new Gaussians use the free room and nothing is pruned for them, so the budget fills faster.
-//! Importance is the largest blend weight α·T over all pixels of the training views of the previous and the
-//! current epoch.
+//! median, except newborns (younger than an epoch, at most `protect` steps). Over the whole run it replaces at
+//! least `rho` · F Gaussians, even if fewer are below this limit, and at most `most_rho` · F, an equal number
+//! at each event. While the model is below the budget, the new Gaussians use the free room and nothing is
+//! pruned for them, so the budget fills faster. Importance is the largest blend weight α·T over all pixels of
+//! the training views of the previous and the current epoch.
 //!
 //! **Parents** are the Gaussians with the largest g = g_p + `colour_weight` · g_c. g_c is the norm of the loss
 //! gradient with respect to the colour, g_p that with respect to the projected mean (NDC), with absolute
 //! values summed over pixels if `gradient` is `abs`. Both are averaged over the views since the last event;
-//! a view at a depth below `full_depth` is weighted by (depth / `full_depth`)². Gaussians seen in fewer than
-//! `least_views` of these views get no children.
+//! a view in which the depth of the Gaussian is below `full_depth` is weighted by (depth / `full_depth`)².
+//! Gaussians seen in fewer than `least_views` of these views get no children.
 //!
 //! **Pruning.** Gaussians below `min_opacity` are pruned. If there is no room for new Gaussians, the least
-//! important ones that are not parents are pruned. Newborns (younger than an epoch, at most `protect` steps)
-//! are pruned only if there are too few others, the oldest first.
+//! important ones that are not parents are pruned; newborns only if there are too few others, the oldest first.
 //!
 //! **Children.** A Gaussian larger than `small` is split along its longest axis: with d = `split_share`, two
 //! halves at ±3d standard deviations, their longest axis 1 − d times the parent's, the others √(1 − d²) times,
@@ -157,7 +156,7 @@ impl DensityPolicy for Merit {
             self.shortfall(now.step, now.scene.initial_rows, plan) + self.turnover(now, plan)?;
         let parents = self.parents(now, plan, births)?;
         let without_room = parents.len().saturating_sub(plan.room());
-        self.prune_least(now, plan, &parents, without_room)?;
+        self.prune_least_important(now, plan, &parents, without_room)?;
         for row in parents {
             // A refusal is counted by the plan.
             let _ = plan.grow(row, self.offspring(now, row as usize)?);
@@ -209,7 +208,7 @@ impl Merit {
 
     /// Prunes the `count` least important rows that are not parents; newborns only if there are too few others,
     /// the oldest first.
-    fn prune_least(
+    fn prune_least_important(
         &self,
         now: &Snapshot<'_>,
         plan: &mut EditPlan,

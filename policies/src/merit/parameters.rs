@@ -34,9 +34,9 @@ pub struct MeritParams {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Gradient {
-    /// [`Signal::ScreenGradientAbs`].
+    /// With absolute values summed over pixels: [`Signal::ScreenGradientAbs`].
     Abs,
-    /// [`Signal::ScreenGradient`].
+    /// Without absolute values: [`Signal::ScreenGradient`].
     Screen,
 }
 

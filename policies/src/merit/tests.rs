@@ -35,12 +35,11 @@ fn the_curve_fills_the_budget_without_a_threshold() {
     assert_eq!(run(&late, "curve_until = 8500").ops.rows_after, 120);
     let low = Event { budget: 99, ..late };
     assert_eq!(run(&low, "curve_until = 8500").ops.rows_after, 99);
-    // Pruned rows are replaced too.
+    // Pruned rows are replaced too, in their own slots.
     let mut opacity = vec![0.5; 60];
     opacity[7] = 0.004;
     opacity[9] = f32::NAN;
     let faint = run(&event.clone().with(Signal::Opacity, &opacity), "curve_until = 8500");
-    // Their slots are reused.
     assert_eq!((faint.pruned, faint.ops.rows_after), (vec![7, 9], 100));
     assert_eq!((faint.ops.counts.removed, faint.cloned.len()), (2, 42));
     // Pruned rows have no children.
@@ -68,8 +67,8 @@ fn all_unimportant_rows_are_replaced() {
     assert_eq!((done.pruned, done.cloned), (vec![0, 1, 2], vec![19, 18, 17]));
     assert_eq!((done.ops.rows_after, done.ops.counts.denied), (20, 0));
     // Each of the 144 events (600 to 14,900) replaces at most 14.4 · 20 / 144 = 2 rows.
-    let most = run(&event, "replaceable = 0.3\nmost_rho = 14.4");
-    assert_eq!(most.pruned, [0, 1]);
+    let limited = run(&event, "replaceable = 0.3\nmost_rho = 14.4");
+    assert_eq!(limited.pruned, [0, 1]);
     // At least `rho`, even if fewer are below the limit: 36 · 20 / 144 = 5.
     assert_eq!(run(&event, "replaceable = 0.3\nrho = 36.0").pruned, [0, 1, 2, 3, 4]);
     // Newborns are not replaced.
@@ -140,8 +139,8 @@ fn needs_list_only_used_signals() {
     let needs = |set| crate::event::build("merit", set, &scene).needs(&scene);
     assert!((needs("").full_depth - 8.0).abs() < 1e-6);
     assert_eq!(needs("").signals.count(), 7);
-    let least = "colour_weight = 0.0\nsmall = 0.0\nprotect = 0\nfull_depth = 0.0";
-    assert_eq!((needs(least).signals.count(), needs(least).full_depth.to_bits()), (4, 0));
+    let minimal = "colour_weight = 0.0\nsmall = 0.0\nprotect = 0\nfull_depth = 0.0";
+    assert_eq!((needs(minimal).signals.count(), needs(minimal).full_depth.to_bits()), (4, 0));
 }
 
 #[test]

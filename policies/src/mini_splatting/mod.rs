@@ -12,12 +12,12 @@
 //! A Gaussian dominates a pixel if no other has a larger blend weight there. One that dominates more than
 //! `dominant_share` of a view's pixels, in any view since the last growth step, covers a whole area and mostly
 //! blurs it, so it is split. (Published as more than H·W/5000 pixels.) These splits follow those of `vanilla`,
-//! those with the largest share first, while there is room.
+//! the largest share first, while there is room.
 //!
 //! **Re-initialisation** at the steps `first_reinit_at` and `second_reinit_at`: the whole model is replaced by
 //! surface points, at most `reinit_share` of the budget, drawn from the pixels of all training views in
 //! proportion to accumulated alpha. The size of a new Gaussian is the root mean square distance to its three
-//! nearest neighbours, and its opacity is `restart_opacity`. Nothing else grows at these steps.
+//! nearest neighbours, and its opacity is `restart_opacity`. No other Gaussians are added at these steps.
 //!
 //! **Sampling** at step `sample_at`. A Gaussian's importance is the sum of its blend weights α·T over all pixels
 //! of all training views, or 0 if it dominates no pixel. (`importance` = "density" divides each view's sum by the
@@ -123,8 +123,9 @@ pub struct MiniSplatting {
     /// Surface points of the current event. This field and the next two are not saved, as each event starts from
     /// zero.
     surface: Vec<Candidate>,
+    /// Importance of each row, summed over the views of the current event.
     importance: ViewAccumulator,
-    /// Number of pixels that each row dominates in the views of the current event.
+    /// Number of pixels that each row dominates in these views.
     dominated: ViewAccumulator,
 }
 
@@ -296,10 +297,10 @@ impl MiniSplatting {
         let total: f64 = importance.iter().map(|&value| f64::from(value)).sum();
         let mut ascending: Vec<f64> = importance.iter().map(|&value| f64::from(value)).collect();
         ascending.sort_unstable_by(f64::total_cmp);
-        let mut prunable = (1.0 - self.params.cut_mass) * total;
+        let mut prunable_importance = (1.0 - self.params.cut_mass) * total;
         let pruned = ascending.iter().take_while(|&&value| {
-            prunable -= value;
-            prunable >= 0.0
+            prunable_importance -= value;
+            prunable_importance >= 0.0
         });
         let count = pruned.count();
         self.params.victims.prune(plan, &importance, count, rng);

@@ -16,7 +16,7 @@ fn event(step: u32, rows: usize) -> Event {
     Event::small_rows(step, rows, rows).with(Signal::Position, &line)
 }
 
-/// A view with these sums of weights, numbers of pixels blended into, and numbers of pixels dominated.
+/// A view in which rows have these sums of blend weights and numbers of pixels, and dominate so many of them.
 fn view(weights: &[f32], pixels: &[f32], dominated: &[f32]) -> View {
     let columns = [
         (AuxColumn::WeightSum, weights),
@@ -105,7 +105,7 @@ fn half_of_the_rows_with_an_importance_are_kept_and_restarted() {
     let restart = Update::restart(0.2, 0.1);
     assert_eq!(done.ops.updates, [(0, restart)]);
     assert_eq!((restart.opacity, restart.sh_degree), (OpacityRule::Set(0.1), Some(0)));
-    // All three rows are kept, at x = 0, 2 and 3. The size of row 0 is √((2² + 3²)/2).
+    // With a share of 1 all three rows are kept, at x = 0, 2 and 3. The size of row 0 is √((2² + 3²)/2).
     let all = run(&event, "sample_share = 1.0");
     assert_eq!(all.pruned, [1, 4]);
     let ScaleRule::Set(size) = all.ops.updates[0].1.scale else { panic!("{:?}", all.ops.updates) };

@@ -1,7 +1,7 @@
 //! The declarations of a policy: the statistics it reads, and changes to initialisation, loss and optimiser.
 //!
-//! The trainer and the backend act on these declarations without knowing the policy. Nothing else is
-//! computed or allocated.
+//! The trainer and the backend act on these declarations without knowing the policy. Only declared statistics are
+//! computed and allocated.
 
 mod pixels;
 mod rates;
@@ -19,7 +19,7 @@ pub use terms::{LossTerms, MaskTerm, NoiseTerm};
 /// The inputs of a policy, and its changes to initialisation and training.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Needs {
-    /// Per-row statistics.
+    /// Statistics of each row that the policy reads.
     pub signals: SignalSet,
     /// Camera depth z₀ `[scene units]`, >= 0, below which a view counts less in the signals of screen
     /// and colour gradients: it is weighted by min(1, z/z₀)², where z is the depth of the row's mean. 0: all
@@ -28,7 +28,7 @@ pub struct Needs {
     /// Gaussians near a camera have large screen gradients but appear in few other views; growing them
     /// mostly produces floaters that fit a single photograph (*Pixel-GS*, Zhang et al. 2024, section 3.3).
     pub full_depth: f32,
-    /// How pixel errors are summed into [`Signal::ErrorScore`].
+    /// The rule by which pixel errors are summed into [`Signal::ErrorScore`].
     pub error_score: ErrorScore,
     /// Pixels to collect as candidates for new rows, if any.
     pub candidates: Option<CandidateRequest>,
@@ -64,11 +64,11 @@ impl Needs {
     /// # Errors
     /// When it is NaN, above 1 or below the declared minimum; the message has the factor and the minimum.
     pub fn check_resolution(&self, factor: f64) -> Result<(), String> {
-        let least = self.least_resolution.unwrap_or(1.0);
-        if (least..=1.0).contains(&factor) {
+        let minimum = self.least_resolution.unwrap_or(1.0);
+        if (minimum..=1.0).contains(&factor) {
             return Ok(());
         }
-        Err(format!("the resolution is {factor}; it must be from {least}, as declared, to 1"))
+        Err(format!("the resolution is {factor}; it must be from {minimum} (as declared) to 1"))
     }
 
     /// Checks that every number is finite and in its range.
@@ -106,18 +106,18 @@ impl Needs {
         above_zero("start.scale", self.start.scale.into())?;
         match self.start.opacity {
             Some(opacity) if !(opacity > 0.0 && opacity < 1.0) => {
-                Err(format!("start.opacity is {opacity}; it must be between 0 and 1"))
+                Err(format!("start.opacity is {opacity}; it must be above 0 and below 1"))
             }
             _ => Ok(()),
         }
     }
 }
 
-fn at_least(name: &str, value: f64, least: f64) -> Result<(), String> {
-    if value.is_finite() && value >= least {
+fn at_least(name: &str, value: f64, minimum: f64) -> Result<(), String> {
+    if value.is_finite() && value >= minimum {
         return Ok(());
     }
-    Err(format!("{name} is {value}; it must be finite and at least {least}"))
+    Err(format!("{name} is {value}; it must be finite and at least {minimum}"))
 }
 
 fn above_zero(name: &str, value: f64) -> Result<(), String> {

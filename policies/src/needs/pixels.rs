@@ -5,7 +5,8 @@ use serde::{Deserialize, Serialize};
 use super::at_least;
 use crate::signals::AuxColumn;
 
-/// How pixel errors are summed into [`Signal::ErrorScore`](crate::policy::Signal::ErrorScore). A view adds
+/// The rule by which pixel errors are summed into [`Signal::ErrorScore`](crate::policy::Signal::ErrorScore). A
+/// view adds
 ///
 /// (Σ w·M(p) / (Σ w)^`footprint`)^`view_power`, with M(p) = e(p)^`power` · (1 + `edge` · g(p) / ḡ),
 ///
@@ -84,7 +85,7 @@ impl ErrorScore {
             if !(lowest..=highest).contains(&value) {
                 let above = if lowest > 0.0 { "above 0" } else { "at least 0" };
                 return Err(format!(
-                    "error_score.{name} is {value}; it must be {above}, at most {highest}"
+                    "error_score.{name} is {value}; it must be {above} and at most {highest}"
                 ));
             }
         }
@@ -117,7 +118,7 @@ pub struct CandidateRequest {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum ErrorMode {
-    /// ‖dL/dC‖₂ of the rendered colour, as in the Diet code. It responds to blurred structure and
+    /// ‖dL/dC‖₂, with C the rendered colour, as in the Diet code. It responds to blurred structure and
     /// not to a constant colour offset.
     #[serde(rename = "grad")]
     Gradient,
@@ -143,7 +144,7 @@ pub enum DepthMode {
 pub struct AuxRequest {
     /// The pixel map M that [`AuxColumn::MapSum`] sums.
     pub map: PixelMap,
-    /// Per-row statistics.
+    /// The statistics of each row to measure.
     pub columns: Vec<AuxColumn>,
     /// Maximum number of surface points per view: pixels drawn without replacement in proportion to their
     /// accumulated alpha, with the surface point of [`DepthMode::MaxWeight`].

@@ -21,8 +21,8 @@ impl Default for Cadence {
 }
 
 impl Cadence {
-    /// True if an optimiser step follows iteration `step`: for `[all other parameters, the
-    /// spherical-harmonic coefficients of bands 1–3]`.
+    /// True if an optimiser step follows iteration `step`: first for all parameters but the
+    /// spherical-harmonic coefficients of bands 1–3, then for these coefficients.
     pub fn steps_at(self, step: u32) -> [bool; 2] {
         let all = self.all.max(1);
         [step.is_multiple_of(all), step.is_multiple_of(self.sh_rest.max(all))]

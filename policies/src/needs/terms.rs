@@ -61,7 +61,7 @@ impl NoiseTerm {
     }
 }
 
-/// A learned mask per row (*Compact 3D Gaussian Representation*, Lee et al. 2024, section 3.1). A row is
+/// A learned mask m per row (*Compact 3D Gaussian Representation*, Lee et al. 2024, section 3.1). A row is
 /// rendered with its opacity and scales multiplied by 1\[σ(m) > `threshold`\], whose derivative in m is taken
 /// to be that of σ(m), and `weight` · mean σ(m) is added to the loss. A row whose mask falls to the threshold
 /// stays transparent, also in saved models, until the policy prunes it.
@@ -71,7 +71,7 @@ impl NoiseTerm {
 pub struct MaskTerm {
     /// Initial m.
     pub start: f32,
-    /// Step size of m, > 0.
+    /// Learning rate of m, > 0.
     pub rate: f32,
     /// Coefficient of the mean of σ(m) over rows, >= 0.
     pub weight: f32,
@@ -85,7 +85,7 @@ impl MaskTerm {
         at_least("mask.weight", self.weight.into(), 0.0)?;
         if !(self.threshold > 0.0 && self.threshold < 1.0) {
             let threshold = self.threshold;
-            return Err(format!("mask.threshold is {threshold}; it must be between 0 and 1"));
+            return Err(format!("mask.threshold is {threshold}; it must be above 0 and below 1"));
         }
         // Beyond this range σ(m) rounds to 0 or 1 and has no derivative.
         if !(-20.0..=20.0).contains(&self.start) {

@@ -57,9 +57,9 @@ fn the_score_of_a_view_depends_on_error_footprint_and_power() {
 #[test]
 fn resolutions_must_be_within_the_declared_range() {
     let needs = Needs { least_resolution: Some(0.3), ..Needs::default() };
-    assert!([0.3, 0.5, 1.0].iter().all(|&share| needs.check_resolution(share).is_ok()));
+    assert!([0.3, 0.5, 1.0].iter().all(|&factor| needs.check_resolution(factor).is_ok()));
     let wrong = [0.29, 1.01, f64::NAN, -0.5];
-    assert!(wrong.iter().all(|&share| needs.check_resolution(share).is_err()));
+    assert!(wrong.iter().all(|&factor| needs.check_resolution(factor).is_err()));
     let whole = Needs::default();
     assert!(whole.check_resolution(1.0).is_ok() && whole.check_resolution(0.99).is_err());
 }

@@ -1,4 +1,4 @@
-//! Compiled plans: the slots to write, in the order in which a backend writes them.
+//! Compiled plans: the slots (places in the parameter arrays) to write, in the order in which a backend does.
 
 use serde::{Deserialize, Serialize};
 
@@ -98,7 +98,7 @@ impl Family {
         Self { parent, first_child, children, fate, placement, shape, opacity }
     }
 
-    /// Fate of the parent's own slot.
+    /// Fate of the parent's row.
     pub fn fate(&self) -> ParentFate {
         self.fate
     }
@@ -317,7 +317,7 @@ impl RowOps {
         let parents = self.families.iter().map(|family| family.parent);
         for row in parents.chain(self.updates.iter().map(|update| update.0)) {
             require((row as usize) < *rows_after || moved.contains(row), || {
-                format!("row {row} is kept, but is beyond row {rows_after} and not moved")
+                format!("row {row} is kept and not moved, but is not before row {rows_after}")
             })?;
         }
         let seeds = self.seeds.iter().map(|seed| &seed.0);
@@ -325,7 +325,7 @@ impl RowOps {
         let appended = new_slots.filter(|&&slot| slot as usize >= *rows_before).count();
         require(appended == rows_after.saturating_sub(*rows_before), || {
             format!(
-                "{appended} rows added beyond row {rows_before}, which does not give {rows_after} rows after"
+                "{appended} rows added from row {rows_before} on, which does not give {rows_after} rows after"
             )
         })
     }

@@ -47,8 +47,8 @@ enum RowEdit {
     Updated,
 }
 
-/// Maximum memory of a plan per row, without seeds `[bytes]`: the edit's byte, and either a family and its
-/// child's slot for every second row (as each family has a child), or an update of each row.
+/// Maximum memory of a plan per row, without seeds `[bytes]`: the edit's byte, and either a family, its shape and
+/// its child's slot for every second row (as each family has a child), or an update of each row.
 pub fn bytes_per_row(needs: &Needs) -> usize {
     let family = size_of::<Family>() + size_of::<u32>();
     let rows = if needs.detailed_edits {
@@ -87,7 +87,8 @@ pub struct EditPlan {
 }
 
 impl EditPlan {
-    /// An empty plan for a model of `rows` rows with a limit of `budget` rows, without detailed edits.
+    /// An empty plan for a model of `rows` rows with a limit of `budget` rows. It refuses detailed edits unless
+    /// [allowed](Self::allowing).
     pub fn new(rows: usize, budget: usize) -> Self {
         Self {
             budget,
@@ -211,7 +212,7 @@ impl EditPlan {
         Ok(())
     }
 
-    /// Reduces the opacities and scales of all rows, or only of [seen](Decay::seen_only) ones. It applies after
+    /// Reduces the opacities and scales of all rows, or only of [seen](Decay::seen_only) ones. A decay applies after
     /// all other edits except [`clamp_opacity`](Self::clamp_opacity), and new rows count as not seen. A later
     /// call replaces an earlier one.
     ///

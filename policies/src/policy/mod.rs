@@ -189,7 +189,7 @@ pub struct Candidate {
     pub position: [f32; 3],
     /// Ground-truth colour, sRGB-encoded in `[0, 1]`.
     pub colour: [f32; 3],
-    /// Width of one pixel at the depth z of the surface point, z / f `[scene units]`, > 0.
+    /// Width of one pixel at the depth of the surface point, depth / focal length `[scene units]`, > 0.
     pub pixel_size: f32,
     /// Error of the pixel in the requested [`ErrorMode`], > 0.
     pub error: f32,

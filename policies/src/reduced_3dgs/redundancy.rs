@@ -61,23 +61,23 @@ impl Ellipsoids<'_> {
             intersected.clear();
             intersected.push(row);
             for other in nearest {
-                let (row, at) = (rows[other.index as usize], points[other.index as usize]);
-                let axes = half_axes[row as usize];
+                let (other_row, at) = (rows[other.index as usize], points[other.index as usize]);
+                let axes = half_axes[other_row as usize];
                 let (short, long) =
                     (axes[0].min(axes[1]).min(axes[2]), axes[0].max(axes[1]).max(axes[2]));
                 let is_farther = |reach: f64| other.square > reach * reach;
                 let meets = || {
                     let from = [0, 1, 2].map(|k: usize| mean[k] - at[k]);
-                    let from = rotate_back(self.orientations[row as usize], from);
+                    let from = rotate_back(self.orientations[other_row as usize], from);
                     sphere_meets(from, radius, axes)
                 };
                 // Fast tests with the inscribed and the circumscribed ball of the ellipsoid.
                 if !is_farther(short + radius) || (!is_farther(long + radius) && meets()) {
-                    intersected.push(row);
+                    intersected.push(other_row);
                 }
             }
-            for &other in &intersected {
-                let known = &mut redundancy[other as usize];
+            for &row in &intersected {
+                let known = &mut redundancy[row as usize];
                 *known = known.min(intersected.len() as f32);
             }
         });
@@ -186,7 +186,7 @@ mod tests {
 
     #[test]
     fn distances_agree_with_points_along_normals() {
-        // A point along the normal of a surface point is at a known distance.
+        // A point on the normal at a surface point is at a known distance from the ellipsoid.
         let rng = PolicyRng::new(3, 1);
         for case in 0..2000 {
             let unit = rng.normal3(case, Purpose::Place, 0).map(f64::from);
@@ -208,7 +208,7 @@ mod tests {
 
     #[test]
     fn vectors_are_rotated_back_onto_the_axes() {
-        // A quarter turn about z takes the row's x axis to the scene's y axis; a quaternion of length 2.
+        // A quarter turn about z takes the row's x axis to the scene's y axis. The quaternion has length 2.
         let half = 2.0_f32.sqrt();
         let turned = rotate_back([half, 0.0, 0.0, half], [0.0, 3.0, 5.0]);
         let expected = [3.0, 0.0, 5.0];

@@ -64,7 +64,7 @@ fn the_fainter_half_of_the_redundant_rows_is_pruned() {
 #[test]
 fn the_smallest_pixel_determines_the_size_of_a_sphere() {
     // Balls 1.45 apart: the next surface is 0.45 away from each mean. √3/2 · 0.577 = 0.5 reaches it;
-    // √3/2 · 0.51 = 0.44 does not, nor do half-axes of 2.6/3.
+    // √3/2 · 0.51 = 0.44 does not. With half-axes of 2.6/3 the next surface is farther away.
     let shifted = event(1000, &[0.0, 1.45, 2.9, -1.45, -2.9, 40.0]);
     let redundancy = |event: &Event, set: &str| {
         let growth = Vanilla::new(Default::default(), &event.scene).unwrap();
@@ -131,9 +131,9 @@ fn prunes_are_every_thousand_steps_except_at_resets() {
     assert_eq!(until, thousands(&|k| k <= 27 && ![3, 6, 9, 12].contains(&k)));
     assert!(prunes(policy("prune_every = 0", REFERENCE_ITERATIONS)).is_empty());
     // 1,000 · 7,000/30,000 = 233.3.
-    let short = find("reduced-3dgs").unwrap();
+    let entry = find("reduced-3dgs").unwrap();
     let scene = SceneInfo { iterations: 7000, ..Event::new(1, 1, 1).scene };
-    let table = short.effective(&Default::default(), &scene).unwrap();
+    let table = entry.effective(&Default::default(), &scene).unwrap();
     let at = |name: &str| table[name].as_integer().unwrap();
     assert_eq!((at("prune_every"), at("prune_until"), at("grow_until")), (233, 7000, 3500));
     let due = due_steps("reduced-3dgs", "grow_every = 0", &Event::new(1, 1, 1).scene);

@@ -82,8 +82,8 @@ fn set(text: &str) -> Table {
 
 #[test]
 fn names_are_sorted_and_unique() {
-    let (a, b, c) = (idle("b", 1), idle("a", 2), idle("c", 3));
-    let names: Vec<_> = sorted(vec![&a, &b, &c]).unwrap().iter().map(|e| e.name).collect();
+    let (a, b, c) = (idle("a", 2), idle("b", 1), idle("c", 3));
+    let names: Vec<_> = sorted(vec![&b, &a, &c]).unwrap().iter().map(|e| e.name).collect();
     assert_eq!(names, ["a", "b", "c"]);
     let twin = idle("c", 1);
     let error = sorted(vec![&a, &c, &b, &twin]).unwrap_err().to_string();
@@ -102,7 +102,7 @@ fn policies_are_found_by_name() {
 }
 
 #[test]
-fn the_manual_is_the_leading_block() {
+fn the_manual_is_the_leading_doc_comment() {
     assert_eq!(idle("idle", 1).manual(), "# Idle\n\nText.\n");
     let plain = PolicyEntry { doc: "Only text.", ..idle("idle", 1) };
     assert_eq!(plain.manual(), "Only text.\n");

@@ -20,11 +20,11 @@
 //!    0..1. The coefficients are parameters (`…_weight`).
 //! 2. Gaussians with g_p of at least `tau` are candidates; as in `vanilla`, small ones are cloned and
 //!    large ones split. The model grows by at most the number of candidates and at most up to the curve
-//!    N(x) = S + (B − S)(2x/M − (x/M)²) at event x of M, from the S initial Gaussians to the budget B.
+//!    N(x) = S + (B − S)(2x/M − (x/M)²) after x of M intervals, from the S initial Gaussians to the budget B.
 //!    Small and large candidates share the growth in proportion to their numbers, and are drawn
 //!    without replacement in proportion to s.
-//! 3. Before step `prune_until`, half (`prune_share`) of the Gaussians that `vanilla` would prune are
-//!    pruned, drawn in proportion to 1/(10⁻⁶ + s).
+//! 3. Before step `prune_until`, half (`prune_share`) of the dead Gaussians (those that `vanilla` would prune)
+//!    are pruned, drawn in proportion to 1/(10⁻⁶ + s).
 //! 4. The gradient statistics are reset.
 //!
 //! Opacities are reset as in `vanilla`. SH bands 1–3 have the learning rate `sh_rest` and step once per
@@ -34,12 +34,12 @@
 //!
 //! ## Differences from the published code
 //!
-//! - The published code draws from all Gaussians and prunes the dead ones (too faint or too large) among those
+//! - The published code draws from all Gaussians and prunes the dead ones among those
 //!   drawn. Its scores date from before splits removed the parents, so their indices refer to other Gaussians.
 //!   `prune = "published"` does both; the default, `candidates`, draws from the dead by their own scores.
 //! - Dead Gaussians do not grow.
 //! - Colour, map and sums come from one render per view; the published code renders twice.
-//! - The edge filter repeats the outermost pixels of an image; the published code keeps their luma instead.
+//! - The edge filter repeats the outermost pixels of an image; the published code takes their luma as the edge there.
 //! - Opacities are trained to the end. The published code stops at step 15,000, apparently by mistake.
 //! - All Gaussians are updated at every iteration; the published code has a mode that skips those off
 //!   screen.
@@ -237,8 +237,8 @@ impl Taming {
         let split = split_by(self.params.split_factor as f32);
         let mut is_split = vec![false; now.rows()];
         for (rows, offspring) in [(clones, clone_at([0.0; 3])), (splits, split)] {
-            let share = growth * rows.len() / candidates.max(1);
-            for row in weighted(&masked(&score, &rows), share, rng) {
+            let count = growth * rows.len() / candidates.max(1);
+            for row in weighted(&masked(&score, &rows), count, rng) {
                 // A refusal is counted by the plan.
                 if plan.grow(row, offspring).is_ok() {
                     is_split[row as usize] = offspring == split;

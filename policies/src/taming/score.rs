@@ -69,7 +69,7 @@ impl Score {
     }
 }
 
-/// Adds to each sum `weight` · x / (median of the positive x) if its x is positive.
+/// Adds to each sum `weight` · x / (median of the positive x) if x, the value of the same row, is positive.
 fn add_term(sums: &mut [f32], weight: f32, values: &[f32]) {
     let Some(median) = median_of_positive(values) else { return };
     for (sum, &x) in sums.iter_mut().zip(values) {

@@ -151,7 +151,7 @@ fn half_of_the_dead_rows_are_pruned() {
     // Nothing is pruned at the last event.
     assert!(run(&Event { step: 14_500, ..event.clone() }, "").pruned.is_empty());
     assert_eq!(run(&Event { step: 14_000, ..event.clone() }, "").pruned.len(), 2);
-    // Rows with a low score are drawn more often; row 0 has none, so it is drawn.
+    // Rows with a low score are drawn more often; row 0 has a score of 0, so it is drawn.
     let mut scored = event.clone();
     let mut radii = vec![2.0; 20];
     radii[0] = 0.0;
@@ -181,7 +181,7 @@ fn the_published_draw_prunes_fewer_and_other_rows() {
     let mut event = event(1000, 400, 400).with(Signal::Opacity, &opacity);
     assert_eq!(run(&event, "").pruned.len(), 2);
     assert!(run(&event, "prune = \"published\"").pruned.is_empty());
-    // Rows 0 and 1 are split. Only index 2 has nearly no score, so it is drawn. Among the remaining rows 2, 3,
+    // Rows 0 and 1 are split. Only index 2 has a score of 0, so it is drawn. Among the remaining rows 2, 3,
     // 4, … index 2 is row 4, which is pruned although the score is that of row 2.
     let mut scale = [0.05; 400];
     scale[..2].fill(0.5);

@@ -32,7 +32,7 @@
 //!
 //! With `governor`, `tau` is not used. Each event grows the Gaussians with the largest g until the model
 //! reaches a curve that rises from the S initial Gaussians to the budget B:
-//! N(x) = S + (B − S)(2x/M − (x/M)²) at event x of M (*Taming 3DGS*, Mallick et al. 2024, equation 2).
+//! N(x) = S + (B − S)(2x/M − (x/M)²) after x of M intervals (*Taming 3DGS*, Mallick et al. 2024, equation 2).
 //!
 //! ## Parameters
 //!
@@ -165,7 +165,7 @@ impl DensityPolicy for Vanilla {
         if self.grow.is_due(now.step) {
             plan.cause("densify");
             self.densify(now, plan)?;
-            // Only the signals of growth: a policy that reuses this growth may reset other signals at its own
+            // Resets only the signals of growth, as a policy that reuses this growth may reset others at its own
             // intervals.
             plan.reset(Reset::Only([Signal::VisibleCount, Signal::ScreenGradient].into()));
         }

@@ -25,7 +25,7 @@ fn policy_is_the_example_of_the_guide() {
     let (guide, policy) =
         (unindented(&read("../../CONTRIBUTING.md")), unindented(&read("src/lib.rs")));
     assert!(guide.contains(policy.trim()), "CONTRIBUTING.md no longer shows src/lib.rs");
-    assert!(policy.lines().filter(|line| !line.is_empty()).count() < 60);
+    assert!(policy.lines().filter(|line| !line.is_empty()).count() < 60, "the example is too long");
 }
 
 /// Runs the program with arguments separated by spaces; returns its exit code and all its output.
@@ -59,10 +59,10 @@ fn policy_trains() {
             image::Rgb([(8 * x) as u8, (10 * y) as u8, 60 * i + (4 * (x ^ y)) as u8])
         });
         picture.save(root.path().join(format!("{i}.png"))).expect("the picture is written");
-        let x = f64::from(i) - 1.0;
+        let camera_x = f64::from(i) - 1.0;
         serde_json::json!({
             "file_path": format!("{i}.png"),
-            "transform_matrix": [[1, 0, 0, x], [0, 1, 0, 0.1 * x], [0, 0, 1, 4], [0, 0, 0, 1]],
+            "transform_matrix": [[1, 0, 0, camera_x], [0, 1, 0, 0.1 * camera_x], [0, 0, 1, 4], [0, 0, 0, 1]],
         })
     };
     let frames: Vec<_> = (0..3).map(frame).collect();
@@ -79,7 +79,7 @@ fn policy_trains() {
     assert_eq!(code, Some(0), "{output}");
     let events = std::fs::read_to_string(run.join("stats/events.jsonl")).expect("a log is written");
     assert_eq!(events.lines().count(), 5, "{events}");
-    // Ten of 200 rows are split per event until the budget is reached.
+    // Each event splits a twentieth of the rows, ten of 200 at first, until the budget is reached.
     let records: Vec<serde_json::Value> =
         events.lines().map(|line| serde_json::from_str(line).expect("a record")).collect();
     assert_eq!(records[0]["cause"], "steady");
