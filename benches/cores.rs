@@ -3,7 +3,7 @@
 //! A step consists of parallel regions, one after the other, and of serial work between them. In a
 //! region, a core takes the next task as soon as it is free. Contention for memory and the cost of
 //! waking cores are not modelled, so the predicted speed-ups are upper bounds.
-//! `cargo bench --bench cores [-- ROWS@SIZE...]`
+//! `cargo bench --bench cores [-- ROWS@SIZE...]`: numbers of Gaussians, and sides of square images in px.
 
 #![expect(clippy::print_stdout, reason = "the output is a table")]
 
@@ -32,7 +32,7 @@ struct StepTimes {
 }
 
 impl StepTimes {
-    /// Medians over the steps whose regions have as many tasks as those of the last step. The numbers of tasks vary,
+    /// Medians over the steps with the same number of tasks in each region as the last step. The numbers vary,
     /// because they depend on the pixels selected as candidates.
     fn median(mut steps: Vec<StepTasks>) -> Self {
         let task_counts = |step: &StepTasks| -> Vec<usize> {
@@ -80,7 +80,7 @@ fn percent(part: Duration, whole: Duration) -> f64 {
     100.0 * part.as_secs_f64() / whole.as_secs_f64().max(1e-12)
 }
 
-/// Measures training steps on one thread. If one fails, prints the error and returns `None`.
+/// Measures training steps on one thread. If a step fails, prints the error and returns `None`.
 fn record(rows: usize, size: u32, needs: Needs) -> Option<StepTimes> {
     let options = Setup {
         threads: Some(1),

@@ -2,8 +2,8 @@
 //!
 //! The CPU backend runs on one, two and all threads, the GPU backend on every adapter with each of its methods of
 //! accumulating gradients (software adapters: small scenes only). `cargo bench --bench stages [-- ROWS@SIZE] [avx2]`:
-//! `10000@256` selects one scene; `avx2` limits the CPU backend to AVX2. Times are medians: CPU time
-//! (which depends little on the load of the machine), wall time, and the wall time of each stage.
+//! `10000@256` selects the scene of 10,000 Gaussians and 256² px; `avx2` limits the CPU backend to AVX2. Times are
+//! medians: CPU time (which depends little on the load of the machine), wall time, and the wall time of each stage.
 
 #![expect(clippy::print_stdout, reason = "the output is a table")]
 

@@ -26,8 +26,8 @@ impl Surface {
         }
     }
 
-    /// Slot of the triangle, nearest point and distance, in local coordinates. Of several triangles at the same
-    /// distance, the first in the model is used.
+    /// Slot of the triangle (its place in the tree's leaves), nearest point and distance, in local coordinates. Of
+    /// several triangles at the same distance, the first in the model is used.
     #[expect(clippy::float_cmp, reason = "ties are exact: the same triangle twice")]
     fn nearest_local(&self, p: DVec3) -> (u32, DVec3, f64) {
         let nodes = &self.bvh.nodes;

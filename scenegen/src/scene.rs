@@ -51,7 +51,7 @@ pub struct Options {
     pub jitter: Option<f64>,
     /// Subsamples along each side of a pixel; 4 means 16 samples.
     pub grid: u32,
-    /// How light from the sky and from other surfaces is computed.
+    /// Method of computing the light from the sky and from other surfaces.
     pub ambient: Option<Ambient>,
     /// An equirectangular `.hdr` or `.exr` image as the sky, in place of the built-in sky and sun.
     pub sky: Option<PathBuf>,
@@ -59,7 +59,7 @@ pub struct Options {
     pub shadows: bool,
     /// If true, all materials are diffuse only.
     pub lambert: bool,
-    /// Factor on all light. `None`: chosen automatically for files with their own lights or sky, otherwise 1.
+    /// Factor on all light. `None`: chosen automatically for files with lights and for images as the sky, otherwise 1.
     pub exposure: Option<f32>,
     /// Largest random change of a training view's exposure `[stops]`, from 0 to 8. Above 0, red and blue also
     /// change by up to 10 %.

@@ -67,7 +67,7 @@ pub(crate) struct Point<'a> {
 /// A pixel's random numbers, and triangles to test first, which speeds up rays but does not change results.
 pub(crate) struct Sampling {
     pub(crate) draws: Draws,
-    /// Slot of a triangle hit by a camera ray.
+    /// Slot (place in the tree's leaves) of a triangle hit by a camera ray.
     pub(crate) hit_hint: Option<u32>,
     /// Slot of the last triangle that occluded a light.
     pub(crate) occluder_hint: Option<u32>,

@@ -13,7 +13,7 @@ use obvhs::ploc::{PlocBuilder, PlocSearchDistance, SortPrecision};
 
 /// Maximum number of triangles of a part. The builder takes about 200 bytes for each.
 const PART: usize = 1 << 16;
-/// Share of the nodes that the last optimisation tries to move: those with the largest boxes.
+/// Share of the nodes that the first round of the last optimisation tries to move: those with the largest boxes.
 const IMPROVED: f32 = 0.1;
 
 /// Builds the tree over `count` triangles with boxes `box_of`. Leaves hold up to eight triangles;
@@ -107,8 +107,8 @@ fn build_part(ids: &[u32], box_of: &impl Fn(u32) -> Aabb) -> Bvh2 {
 fn improve(tree: &mut Bvh2) {
     let mut optimiser = ReinsertionOptimizer::default();
     let mut largest: Vec<(f32, u32)> = Vec::new();
-    for part in (1..32).step_by(2) {
-        let count = (tree.nodes.len() as f32 * IMPROVED / part as f32) as usize;
+    for divisor in (1..32).step_by(2) {
+        let count = (tree.nodes.len() as f32 * IMPROVED / divisor as f32) as usize;
         if count == 0 {
             break;
         }

@@ -9,7 +9,7 @@ use densify_scenegen::mesh::Model;
 use glam::DVec3;
 use process::status;
 
-/// Allowed memory of obvhs's builder for one part: 65,536 triangles of 300 bytes.
+/// Allowed memory of obvhs's builder for one part: 65,536 triangles with 300 bytes each.
 const PART_BYTES: u64 = 20 << 20;
 /// Allowed memory per triangle: its index while parts are split, and candidates of the last optimisation.
 const TRIANGLE_BYTES: u64 = 4 + 8;

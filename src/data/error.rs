@@ -5,8 +5,8 @@ use std::path::{Path, PathBuf};
 
 use densify_core::files::one_line;
 
-/// A dataset, one of its images, or a model that cannot be loaded. Remedies by options are data, because the names of
-/// options depend on the interface that shows the error; the `Display` text leaves these remedies out.
+/// A dataset, one of its images, or a model that cannot be loaded. A remedy that names an option is a [`LoadRemedy`]
+/// and no part of the `Display` text, because options' names depend on the interface that shows the error.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum LoadError {
     /// A fault that no option remedies: the file, the field, and the remedy.

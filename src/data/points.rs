@@ -113,10 +113,10 @@ fn full_scale(path: &Path, vertices: &Element, channels: [usize; 3]) -> Result<f
     {
         return Ok(kinds[0].largest());
     }
-    let (mut most, mut is_whole) = (0.0_f64, true);
+    let (mut max_value, mut is_whole) = (0.0_f64, true);
     Ply::open(path)?.each_row(vertices, &channels, |row| {
         for value in row.iter().filter(|value| value.is_finite()) {
-            most = most.max(*value);
+            max_value = max_value.max(*value);
             is_whole &= value.fract() == 0.0;
         }
     })?;
@@ -124,12 +124,12 @@ fn full_scale(path: &Path, vertices: &Element, channels: [usize; 3]) -> Result<f
     let is_real = largest.is_infinite();
     let brightest = if is_whole { 1.0 } else { BRIGHTEST };
     let scales = [(is_real, brightest, 1.0), (true, 255.0, 255.0), (true, 65_535.0, 65_535.0)];
-    let scale = scales.into_iter().find(|(applies, limit, _)| *applies && most <= *limit);
+    let scale = scales.into_iter().find(|(applies, limit, _)| *applies && max_value <= *limit);
     match scale {
         Some((.., full)) => Ok(full),
         None if is_real => {
             let problem =
-                format!("they reach {most}, but colours must be from 0 to 1, 255 or 65535");
+                format!("they reach {max_value}, but colours must be from 0 to 1, 255 or 65535");
             Err(LoadError::damaged(path, "colours of the vertices", problem))
         }
         None => Ok(largest),

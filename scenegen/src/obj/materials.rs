@@ -222,15 +222,15 @@ fn factor(given: Option<Vec3>, has_map: bool, default: f32) -> Vec3 {
     }
 }
 
-/// The first numbers of a statement, at most `most`; a single number is used for all three components.
-fn numbers(statement: Statement<'_>, most: usize) -> Result<Vec3, Error> {
+/// The first numbers of a statement, at most `max_count`; a single number is used for all three components.
+fn numbers(statement: Statement<'_>, max_count: usize) -> Result<Vec3, Error> {
     let fault = |problem: &str| statement.fault(format!("{} {problem}", statement.key));
     let number = |word: &str| match word.parse::<f32>() {
         Ok(value) if value.is_finite() => Ok(value.max(0.0)),
         _ => Err(fault("is not a finite number")),
     };
     // The option `-halo` of `d -halo 0.5` is ignored.
-    let words = statement.words().filter(|word| *word != "-halo").take(most);
+    let words = statement.words().filter(|word| *word != "-halo").take(max_count);
     match words.map(number).collect::<Result<Vec<_>, _>>()?[..] {
         [r, g, b] => Ok(Vec3::new(r, g, b)),
         [grey] => Ok(Vec3::splat(grey)),
@@ -257,16 +257,16 @@ impl Map {
         while rest.starts_with('-') {
             let (option, mut after) = split_word(rest);
             // Some options take up to three numbers, of which the later ones are optional.
-            let most = match option {
+            let max_count = match option {
                 "-o" | "-s" | "-t" => 3,
                 "-mm" => 2,
                 _ => 1,
             };
             let mut values = Vec::new();
-            while values.len() < most {
+            while values.len() < max_count {
                 let (word, behind) = split_word(after);
                 let number = word.parse::<f32>().ok().filter(|v| v.is_finite());
-                if most > 1 && number.is_none() {
+                if max_count > 1 && number.is_none() {
                     break;
                 }
                 if option == "-clamp" {

@@ -32,13 +32,13 @@ impl<'a> Statement<'a> {
         self.value().split_whitespace()
     }
 
-    /// The first words, at most `most`, as numbers.
-    pub(super) fn numbers(&self, most: usize) -> Result<Vec<f64>, Error> {
+    /// The first words, at most `max_count`, as numbers.
+    pub(super) fn numbers(&self, max_count: usize) -> Result<Vec<f64>, Error> {
         let parse = |word: &str| {
             word.parse()
                 .map_err(|_| self.fault(format!("{:?} is not a number", resource::shortened(word))))
         };
-        self.words().take(most).map(parse).collect()
+        self.words().take(max_count).map(parse).collect()
     }
 
     /// The first three words as a vector.

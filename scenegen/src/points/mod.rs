@@ -17,7 +17,7 @@ const MIN_VIEWS: usize = 3;
 const CANDIDATES: f64 = 2.0;
 /// Added to every pixel's gradient: half a step of eight bits.
 const GRADIENT_FLOOR: f64 = 0.5;
-/// Side of the cubes that are dropped as a whole, as a share of the diagonal.
+/// Side of the cubes that are dropped as a whole, as a share of the scene's diagonal.
 const PATCH: f64 = 0.02;
 /// Largest relative difference between a point's depth and the visible depth at which a view sees the point.
 const SAME_DEPTH: f64 = 1e-3;
@@ -27,7 +27,7 @@ const SAME_DEPTH: f64 = 1e-3;
 pub struct PointOptions {
     /// Number of points; fewer if the views do not see enough.
     pub count: usize,
-    /// Standard deviation of the noise on each coordinate, as a share of the diagonal.
+    /// Standard deviation of the noise on each coordinate, as a share of the scene's diagonal.
     pub noise: f64,
     /// Share of points that are placed at random in the bounding box enlarged by a fifth.
     pub outliers: f64,

@@ -41,7 +41,7 @@ pub(crate) enum Build {
         /// Default size.
         default: u32,
         /// Largest size; the smallest is 1.
-        most: u32,
+        largest: u32,
         build: fn(size: u32, seed: u64) -> Staging,
     },
 }

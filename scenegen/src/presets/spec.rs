@@ -40,12 +40,12 @@ impl FromStr for PresetSpec {
                 let problem = format!("the preset {name} has a fixed size; write {name}");
                 return Err(Error::Input(format!("{text}: {problem}")));
             }
-            (Some(size), Build::Sized { default, most, .. }) => {
-                match size.parse().ok().filter(|size| (1..=most).contains(size)) {
+            (Some(size), Build::Sized { default, largest, .. }) => {
+                match size.parse().ok().filter(|size| (1..=largest).contains(size)) {
                     Some(size) => Some(size).filter(|&size| size != default),
                     None => {
                         return Err(Error::Input(format!(
-                            "{text}: {size:?} is not a size of the preset {name}; write {name}:1 to {name}:{most}"
+                            "{text}: {size:?} is not a size of the preset {name}; write {name}:1 to {name}:{largest}"
                         )));
                     }
                 }

@@ -58,7 +58,7 @@ pub struct Rig {
     pub elevation: [f64; 2],
     /// Range of azimuths, centred on +z `[degrees]`.
     pub arc: f64,
-    /// Standard deviation of camera positions, as a share of the distance to the point looked at.
+    /// Standard deviation of random shifts of the cameras, as a share of the distance to the point looked at.
     pub jitter: f64,
     /// Smallest distance from any surface, as a share of the geometry's diagonal.
     pub clearance: f64,
@@ -136,9 +136,9 @@ impl Rig {
         if u64::from(self.width) * u64::from(self.height) > 1 << 28 {
             return Err(Error::option("--size", "an image may have at most 2^28 pixels"));
         }
-        for (option, least, count) in [("--train", 1, self.train), ("--test", 0, self.test)] {
-            if !(least..=100_000).contains(&count) {
-                let problem = format!("{count} is not between {least} and 100000");
+        for (option, min, count) in [("--train", 1, self.train), ("--test", 0, self.test)] {
+            if !(min..=100_000).contains(&count) {
+                let problem = format!("{count} is not between {min} and 100000");
                 return Err(Error::option(option, problem));
             }
         }

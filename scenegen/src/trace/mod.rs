@@ -18,9 +18,9 @@ use crate::texture::encode;
 const MAX_LAYERS: usize = 64;
 /// Transmittance at which a ray ends: half a step of eight bits.
 const MIN_TRANSMITTANCE: f32 = 1.0 / 512.0;
-/// Number of rows traced by one task.
+/// Number of rows of pixels traced by one task.
 const BAND: usize = 4;
-/// Width of the tiles of a band; empty tiles are skipped.
+/// Width of the tiles of a band `[px]`; empty tiles are skipped.
 const TILE: usize = 8;
 
 /// One rendered view.

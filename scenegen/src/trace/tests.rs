@@ -162,11 +162,11 @@ fn the_white_furnace_is_white() {
         roughness,
         ..Material::default()
     };
-    for (roughness, least) in [(0.1, 0.97), (0.3, 0.93), (1.0, 0.35)] {
+    for (roughness, min) in [(0.1, 0.97), (0.3, 0.93), (1.0, 0.35)] {
         for ambient in [Ambient::Open, Ambient::Bounce(64)] {
             let mean = furnace(metal(roughness), ambient);
             let linear = crate::texture::linear_from_srgb(f64::from(mean) / 255.0) / 0.5;
-            assert!(linear < 1.01 && linear > least, "{roughness}, {ambient:?}: {linear}");
+            assert!(linear < 1.01 && linear > min, "{roughness}, {ambient:?}: {linear}");
         }
     }
 }

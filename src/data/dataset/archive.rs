@@ -1,4 +1,5 @@
-//! Datasets in ZIP archives, unpacked into a temporary folder that is removed with the dataset's last view.
+//! Datasets in ZIP archives, unpacked into a temporary folder, which is removed when the dataset and all its
+//! views are dropped.
 //!
 //! The reader of each format then sees an ordinary folder, from which photographs are decoded as fast as from any other
 //! folder. Archives are untrusted: no name leads out of the folder, no links are created, and the unpacked size is
@@ -98,11 +99,11 @@ impl Unpacked {
             let mut file = archive.by_index(index).map_err(|error| broken(path, &error))?;
             let Some(name) = data_name(path, &file)? else { continue };
             let target = temporary.path().join(&name);
-            let made = target.parent().map_or(Ok(()), fs::create_dir_all);
+            let parent = target.parent().map_or(Ok(()), fs::create_dir_all);
             // A second file of the same name must not replace the first.
-            let made =
-                made.and_then(|()| OpenOptions::new().write(true).create_new(true).open(&target));
-            let mut output = made.map_err(|error| match error.kind() {
+            let opened =
+                parent.and_then(|()| OpenOptions::new().write(true).create_new(true).open(&target));
+            let mut output = opened.map_err(|error| match error.kind() {
                 io::ErrorKind::AlreadyExists | io::ErrorKind::NotADirectory => {
                     malformed(path, &name, "another file has this name")
                 }

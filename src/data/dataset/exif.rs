@@ -39,9 +39,9 @@ impl Exif {
     /// Reads the fields of an open file, from its start.
     pub(super) fn read(file: File) -> Self {
         // The length of the file bounds the allocations, whatever lengths its fields claim.
-        let is_readable = file.metadata().is_ok_and(|data| data.len() <= MAX_BYTES);
+        let is_small = file.metadata().is_ok_and(|data| data.len() <= MAX_BYTES);
         let fields =
-            is_readable.then(|| exif::Reader::new().read_from_container(&mut BufReader::new(file)));
+            is_small.then(|| exif::Reader::new().read_from_container(&mut BufReader::new(file)));
         let Some(Ok(fields)) = fields else { return Self::default() };
         Self { orientation: orientation(&fields), exposure: exposure(&fields) }
     }

@@ -140,11 +140,12 @@ impl Folders {
     }
 
     pub(super) fn missing(&self, named: DataPath<'_>) -> LoadError {
-        LoadError::missing_image(named.file, named.field, &self.first_path(named))
+        LoadError::missing_image(named.file, named.field, &self.shown_path(named))
     }
 
-    /// The first path that is tried for an image.
-    pub(super) fn first_path(&self, named: DataPath<'_>) -> PathBuf {
+    /// The path that messages name for a missing image: the first one tried, or the bare file name in `--images` if
+    /// the listed path is absolute.
+    pub(super) fn shown_path(&self, named: DataPath<'_>) -> PathBuf {
         match &self.chosen {
             Some(folder) if is_absolute(named.value) => {
                 let last = named.suffixes().ok().and_then(Iterator::last);

@@ -55,7 +55,7 @@ impl FrameLists {
         Ok(())
     }
 
-    /// Whether a frame is trained on, and whether it is tested on.
+    /// Two flags: the frame is trained on; it is tested on.
     pub(super) fn splits(&mut self, file: &str, found: Option<&ImageFile>) -> (bool, bool) {
         let key = key(file, found);
         let [train, validation, test] = self.lists.each_mut().map(|list| {
@@ -88,7 +88,7 @@ impl FrameLists {
         (0..3).find(|&list| self.names_any(list) || list == 0 && self.lists[0].is_some())
     }
 
-    /// Whether the lists define which frames are tested on.
+    /// Returns true if the lists define which frames are tested on.
     pub(super) fn define_the_split(&self) -> bool {
         self.defining_list().is_some()
     }

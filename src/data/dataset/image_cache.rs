@@ -1,7 +1,7 @@
 //! A cache of decoded images with a size limit, filled ahead of use by background threads.
 //!
-//! Training visits every view once per epoch, in a new order each time. On average, the view used last is therefore the
-//! last to be needed again, so the most recently used image that is not announced is evicted first.
+//! Training visits every view once per epoch, in a new order each time, and announces the views that it needs next. Of
+//! the others, the most recently used one will on average be needed latest, so its image is evicted first.
 //! (Least-recently-used eviction would almost always miss once the images do not all fit.)
 
 use std::collections::VecDeque;
@@ -37,6 +37,7 @@ struct State {
     queue: VecDeque<usize>,
     /// Size of the images that are cached or being loaded `[bytes]`.
     bytes: u64,
+    /// Number of accesses so far.
     clock: u64,
     end: bool,
 }
@@ -234,7 +235,7 @@ pub struct ImageDemand {
     pub all: u64,
     /// The largest decoded image `[bytes]`.
     pub largest: u64,
-    /// Largest additional memory while an image is loaded `[bytes]`.
+    /// Largest memory for loading an image, in addition to the decoded image `[bytes]`.
     pub working: u64,
 }
 
@@ -321,7 +322,7 @@ mod tests {
                 cache.get(index).unwrap();
             }
         }
-        // Of 54 accesses after the first round, at least 3 in 6 hit; none would with least-recently-used eviction.
+        // Of the 54 accesses after the first round, at least half hit; none would with least-recently-used eviction.
         assert!(hits >= 27, "{hits}");
         assert_eq!(held(&cache).len(), 4);
     }

@@ -130,12 +130,12 @@ impl ImageSource {
         3 + u64::from(self.may_be_transparent()) + u64::from(self.is_masked())
     }
 
-    /// Whether loaded images may have transparent pixels.
+    /// Returns true if the loaded image may have transparent pixels.
     pub(crate) fn may_be_transparent(&self) -> bool {
         self.header.has_alpha || self.mask_becomes_transparency()
     }
 
-    /// Whether loaded images have a mask: from a file, or of the field of view of the lens.
+    /// Returns true if the loaded image has a mask: from a file, or of the field of view of the lens.
     pub fn is_masked(&self) -> bool {
         let is_ignored = |mask: &Mask| mask.mode == MaskMode::Ignore;
         self.mask.as_ref().is_some_and(is_ignored)

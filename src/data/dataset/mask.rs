@@ -191,8 +191,8 @@ mod tests {
         assert_eq!(read([1, 1, 1]), [255; 3]);
         assert_eq!(read([0, 1, 2]), [0, 1, 2]);
         assert_eq!(read([0, 0, 0]), [0; 3]);
-        let deep = |most: u16| {
-            let image = ImageBuffer::from_fn(2, 1, |x, _| image::Luma([x as u16 * most]));
+        let deep = |largest: u16| {
+            let image = ImageBuffer::from_fn(2, 1, |x, _| image::Luma([x as u16 * largest]));
             values(image.into()).into_raw()
         };
         assert_eq!(deep(1), [0, 255]);

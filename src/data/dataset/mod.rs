@@ -91,8 +91,8 @@ pub struct Dataset {
     pub notes: Vec<Note>,
 }
 
-/// A note for the user about a dataset. Options are given by variants, since their names depend on the interface that
-/// shows the note.
+/// A note for the user about a dataset. Notes that name an option are variants of their own, because the option's name
+/// depends on the interface that shows the note.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Note {
     /// A note that names no option.
@@ -139,7 +139,7 @@ struct Scene {
     /// The file that lists the frames.
     listing: PathBuf,
     frames: Vec<Frame>,
-    /// The first path at which the first missing image was looked for.
+    /// Path of the first missing image, for messages.
     first_missing: Option<PathBuf>,
     points: PointCloud,
     points_file: Option<PathBuf>,

@@ -50,7 +50,7 @@ pub fn median(mut values: Vec<f64>) -> Option<f64> {
     (!values.is_empty()).then(|| *values.select_nth_unstable_by(middle, f64::total_cmp).1)
 }
 
-/// Marks cameras whose poses are probably wrong, because they are few and far away from all others. Shape: `[cameras]`.
+/// Marks the few cameras that are far away from all others; their poses are probably wrong. Shape: `[cameras]`.
 pub(super) fn outliers(centres: &[DVec3]) -> Vec<bool> {
     let along = |axis: usize| {
         median(centres.iter().map(|centre| centre[axis]).collect()).unwrap_or_default()
@@ -64,8 +64,8 @@ pub(super) fn outliers(centres: &[DVec3]) -> Vec<bool> {
     }
     let far: Vec<bool> = distances.iter().map(|&d| d > OUTLIER_DISTANCE * unit).collect();
     let count = far.iter().filter(|&&far| far).count();
-    let most = ((MAX_OUTLIERS * centres.len() as f64) as usize).max(1);
-    if count > most { vec![false; centres.len()] } else { far }
+    let max_count = ((MAX_OUTLIERS * centres.len() as f64) as usize).max(1);
+    if count > max_count { vec![false; centres.len()] } else { far }
 }
 
 impl Normalisation {
@@ -83,11 +83,11 @@ impl Normalisation {
         let away = |row| DVec3::from(model.position(row)).distance(centre);
         let mut away: Vec<f64> = (0..model.len()).map(away).collect();
         away.sort_unstable_by(f64::total_cmp);
-        // The last fifth is mostly background, which may be very far away.
-        let most =
-            away.get(away.len().saturating_sub(1) * 4 / 5).copied().filter(|&most| most > 0.0);
+        // The farthest fifth is mostly background, which may be very far away.
+        let near =
+            away.get(away.len().saturating_sub(1) * 4 / 5).copied().filter(|&near| near > 0.0);
         let all = || away.last().map_or(1.0, |last| last.max(1.0));
-        let scale = 1.0 / most.unwrap_or_else(all);
+        let scale = 1.0 / near.unwrap_or_else(all);
         if scale.is_normal() && centre.is_finite() {
             Self { centre, scale }
         } else {
@@ -141,7 +141,8 @@ impl Normalisation {
         self.mapped(world, [0.0; 3], self.scale.ln(), |world| self.scene_from_world(world))
     }
 
-    /// Transforms a model in place, as it may take most of the memory.
+    /// Maps positions by `point`, measures means from `origin` and adds `ln_scale` to log-scales. Works in place, as
+    /// the model may take most of the memory.
     fn mapped(
         &self,
         mut model: Gaussians,
@@ -168,8 +169,8 @@ impl Normalisation {
         self.centre.length() * self.scale > F32_DISTANCE
     }
 
-    /// The world point from which local coordinates are measured: the centre of the scene, rounded to a power of ten
-    /// below the radius of the cameras.
+    /// The world point from which local coordinates are measured: the centre of the scene, rounded to multiples of a
+    /// power of ten below the radius of the cameras.
     pub fn local_origin(&self) -> [f64; 3] {
         round_origin(self.centre.to_array(), 1.0 / self.scale)
     }
@@ -251,11 +252,11 @@ mod tests {
             [DVec3::new(0.3, 1.7, -2.0), DVec3::new(1.1, 0.2, 0.9), DVec3::new(-0.7, 0.4, 0.1)];
         let points = [DVec3::new(0.123, 4.5, -6.7)];
         let scene = |k: i32| {
-            let by = 2f64.powi(k);
-            let n = Normalisation::fit(&centres.map(|c| c * by), &[]);
+            let factor = 2f64.powi(k);
+            let n = Normalisation::fit(&centres.map(|c| c * factor), &[]);
             (
-                n.scene_from_world(points[0] * by),
-                n.scene_from_world_camera(&camera(centres[1] * by)).translation,
+                n.scene_from_world(points[0] * factor),
+                n.scene_from_world_camera(&camera(centres[1] * factor)).translation,
             )
         };
         for k in [-20, -3, 5, 20] {

@@ -46,7 +46,7 @@ pub(super) fn photographs(
         let listing = listing.to_owned();
         return Err(LoadError::NoMasks { listing, inverted: options.invert_masks });
     }
-    // All frames are checked before the first error is reported, so that the message does not depend on the threads.
+    // All frames are checked before the first error is reported, so that the message does not depend on timing.
     let checked: Vec<_> = frames.par_iter().map(|frame| check(listing, frame)).collect();
     let checked: Vec<Checked> = checked.into_iter().collect::<Result<_, _>>()?;
     let texts =
@@ -60,7 +60,7 @@ pub(super) fn photographs(
             "images narrower than {width} px are not enlarged ({first})"
         )));
     }
-    // Consecutive photographs mostly share a camera, and thus its pinholes.
+    // Here a run is a sequence of photographs with the same lens, and thus the same pinholes.
     let mut runs = Vec::new();
     let mut first = 0;
     for run in checked.chunk_by(|a, b| a.lens == b.lens) {
@@ -175,7 +175,8 @@ fn lens_error(frame: &Frame, lens: &Lens, error: PinholeError) -> LoadError {
     LoadError::malformed(image, origin, problem, remedy)
 }
 
-/// Notes about split and cropped photographs. For each lens, `all` has the number of its photographs and its pinholes.
+/// Notes about photographs that become several views or are cropped. For each lens, `all` has the number of its
+/// photographs and its pinholes.
 fn pinhole_notes<'a>(
     all: impl Iterator<Item = (usize, &'a Option<Pinholes>)> + Clone,
     keep_fov: bool,
@@ -278,7 +279,7 @@ fn photograph(
     };
     let hidden = match &mask {
         None => Vec::new(),
-        // Masks are decoded one at a time; a run's planned memory includes one.
+        // Masks are decoded one at a time; the memory that a training run plans includes one.
         Some(mask) => {
             let weights = mask.read_weights(|found| check_mask(mask, found, header))?;
             views.iter().map(|view| is_hidden(view, views.len() > 1, &weights, &lens)).collect()
@@ -298,8 +299,8 @@ fn check_mask(mask: &Mask, header: ImageHeader, image: ImageHeader) -> Result<()
 
 /// Returns true if a mask hides all of a view; `several` is true if its photograph has more than one view.
 fn is_hidden(view: &View, several: bool, mask: &GrayImage, lens: &Lens) -> bool {
-    /// If a photograph has several views, at least this many pixels along the longer side of its mask are tested, and
-    /// at most twice as many.
+    /// If a photograph has several views, at least this many pixels along the longer side of its mask (or all, if the
+    /// mask is smaller) are tested, and at most twice as many.
     const SAMPLED_SIDE: u32 = 512;
     let (width, height) = mask.dimensions();
     let stride = if several { (width.max(height) / SAMPLED_SIDE).max(1) } else { 1 } as usize;

@@ -88,21 +88,21 @@ pub(super) fn check_lens(file: &Path, camera: &str, lens: &Lens) -> Result<(), L
         return fault(format!("omega = {omega} is not within {MAX_OMEGA} of 0"));
     }
     for (name, focal, side) in [("fx", lens.focal.x, size.x), ("fy", lens.focal.y, size.y)] {
-        let (half, most) = match lens.distortion.plane {
+        let (half, max) = match lens.distortion.plane {
             Projection::Perspective => ((0.5 * side / focal).atan(), *FIELD_OF_VIEW.end()),
             Projection::Equidistant | Projection::Fov(_) => (0.5 * side / focal, MAX_FISHEYE_FOV),
         };
         let degrees = 2.0 * half.to_degrees();
-        if !(*FIELD_OF_VIEW.start()..=most).contains(&degrees) {
-            let wide = if degrees > most && lens.distortion.plane == Projection::Perspective {
+        if !(*FIELD_OF_VIEW.start()..=max).contains(&degrees) {
+            let hint = if degrees > max && lens.distortion.plane == Projection::Perspective {
                 "; a lens this wide is a fisheye: use a fisheye model, or undistort its images to a pinhole"
             } else {
                 ""
             };
             return fault(format!(
                 "the focal length {name} = {focal} px at {side} px means a field of view of {degrees:.2} degrees, \
-                 outside of {:?}{wide}",
-                *FIELD_OF_VIEW.start()..=most
+                 outside of {:?}{hint}",
+                *FIELD_OF_VIEW.start()..=max
             ));
         }
     }

@@ -40,7 +40,8 @@ pub(super) fn text_notes(notes: Vec<String>) -> Vec<Note> {
     notes.into_iter().map(Note::Text).collect()
 }
 
-/// Splits photographs, which are sorted by name, and moves everything to normalised coordinates.
+/// Divides photographs, which are sorted by name, into training and test views, and moves everything to normalised
+/// coordinates.
 pub(super) fn assemble(
     path: &Path,
     photographs: Vec<Photograph>,
@@ -163,8 +164,8 @@ fn first_names(names: &[impl AsRef<str>]) -> Option<String> {
 }
 
 fn refuse_duplicates(listing: &Path, frames: &[Frame]) -> Result<(), LoadError> {
-    // Absolute paths are matched by suffix. Two of them may therefore lead to one file, which could then be both trained
-    // on and held out.
+    // Absolute paths are matched by suffix. Two of them may therefore lead to one file, which could then be both
+    // trained on and held out.
     let mut by_image = HashMap::new();
     for frame in frames {
         let first = *by_image.entry(&frame.image).or_insert(frame);

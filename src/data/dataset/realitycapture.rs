@@ -1,6 +1,7 @@
 //! Reads the CSV file that RealityCapture (RealityScan) exports as "Internal/External camera parameters".
 //!
-//! Each line is a photograph: `#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2`, angles in degrees.
+//! The header is `#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2`; each line after it is a photograph, with
+//! angles in degrees.
 //! RealityScan 2 calls some columns `yaw`, `f_35mm`, `px_norm` and `py_norm`. With all angles 0 a camera looks straight
 //! down and the top of its image is north (+y); heading turns it clockwise about the vertical, pitch raises its view
 //! towards the horizon, roll tilts it sideways (Capturing Reality, *Registration export and camera orientations*). `f`
@@ -116,7 +117,7 @@ fn read(root: &Root, options: &LoadOptions) -> Result<Option<Scene>, LoadError> 
             Some(found) => (&in_images, found),
             None => {
                 let Some(found) = in_root.image(named)? else {
-                    first_missing.get_or_insert_with(|| in_images.first_path(named));
+                    first_missing.get_or_insert_with(|| in_images.shown_path(named));
                     missing.push(name.to_owned());
                     continue;
                 };
@@ -233,7 +234,7 @@ impl Row<'_> {
         Ok((rotation, -(rotation * centre)))
     }
 
-    /// The lens at the size of the image, which the table does not state, and the header of the image.
+    /// The lens at the full size of the image, which the table does not state, and the header of the image.
     fn lens(
         &self,
         frame: &str,

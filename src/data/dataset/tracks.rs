@@ -68,7 +68,7 @@ impl Tracks {
 #[derive(Debug)]
 pub(super) struct TrackSampler {
     tracks: Tracks,
-    /// Distance between kept tracks.
+    /// Every `stride`-th track is kept.
     stride: usize,
     seen: usize,
 }

@@ -26,7 +26,8 @@ enum Transfer {
     HighRange(&'static str),
 }
 
-/// The exponent to which a PNG's values raise linear light; `None` if the values are, or may be, sRGB.
+/// The exponent to which a PNG's values raise linear light; `None` if the values are, or may be, sRGB, or if they have
+/// a high dynamic range.
 pub(super) fn exponent(input: impl BufRead + Seek) -> Option<f64> {
     match stated_transfer(input)? {
         Transfer::Exponent(exponent) => Some(exponent),

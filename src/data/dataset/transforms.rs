@@ -91,7 +91,7 @@ fn read_single(root: &Root, options: &LoadOptions) -> Result<Option<Scene>, Load
     read(root, &Folders::new(root, options, false)?, SINGLE, declared).map(Some)
 }
 
-/// What decides which frames of a file are for training and which are for tests.
+/// The source of the division of a file's frames into those for training and those for tests.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum DeclaredSplit {
     /// All are for training.
@@ -145,7 +145,7 @@ fn read(
             DeclaredSplit::InLists => lists.splits(file, found.as_ref()),
         };
         let Some(found) = found else {
-            first_missing.get_or_insert_with(|| folders.first_path(named));
+            first_missing.get_or_insert_with(|| folders.shown_path(named));
             missing.push(file.to_owned());
             continue;
         };

@@ -62,13 +62,13 @@ impl Part {
 /// side.
 fn span(from: f64, to: f64, size: u32) -> [u32; 2] {
     let (from, to) = (from * f64::from(size), to * f64::from(size));
-    let least = f64::from(MIN_SIDE.min(size));
+    let min_side = f64::from(MIN_SIDE.min(size));
     let middle = 0.5 * (from + to);
-    let (from, to) = (from.min(middle - 0.5 * least), to.max(middle + 0.5 * least));
+    let (from, to) = (from.min(middle - 0.5 * min_side), to.max(middle + 0.5 * min_side));
     // Shift the span back into the image.
-    let back = (-from).max(0.0) - (to - f64::from(size)).max(0.0);
-    let first = (from + back).max(0.0).floor() as u32;
-    let last = ((to + back).ceil() as u32).min(size);
+    let shift = (-from).max(0.0) - (to - f64::from(size)).max(0.0);
+    let first = (from + shift).max(0.0).floor() as u32;
+    let last = ((to + shift).ceil() as u32).min(size);
     [first, last - first]
 }
 

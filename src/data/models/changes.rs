@@ -97,7 +97,7 @@ fn row_changes(
     bases: &[[f32; 16]],
 ) -> [f64; 4] {
     let [old, new] = [&model.log_scales[row], &saved.log_scales[index]].map(|logs| logs.map(size));
-    // The thinnest axis of a flat Gaussian is visible only from its edge, so the middle axis sets the scale.
+    // The thinnest axis of a flat Gaussian is visible only edge-on, so changes are relative to the middle axis.
     let middle = sorted(old)[1];
     let shift = (0..3).map(|axis| {
         let [a, b] = [&model.means[row], &saved.means[index]].map(|mean| f64::from(mean[axis]));

@@ -25,7 +25,7 @@ pub enum Coordinates {
     Double,
 }
 
-/// What the coordinates of a file are measured from, and their type.
+/// The point from which the coordinates of a file are measured, and their type.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Frame {
     /// The offset: a position is a coordinate plus this `[world units]`. For coordinates in f64, the point from which
@@ -192,7 +192,8 @@ pub fn local_origin(model: &Gaussians) -> [f64; 3] {
     round_origin(middle.to_array(), spread)
 }
 
-/// A point near the middle of coordinates, by axis, that are so far from 0 that f32 may be too coarse; otherwise 0.
+/// A point near the middle of coordinates, given by axis, if they are so far from 0 that f32 may be too coarse; 0
+/// otherwise, or if all of them are exact in f32.
 pub(super) fn remote_origin(axes: [Vec<f64>; 3]) -> [f64; 3] {
     let is_exact = |value: &f64| f64::from(*value as f32).to_bits() == value.to_bits();
     if axes.iter().flatten().all(is_exact) {
@@ -203,7 +204,7 @@ pub(super) fn remote_origin(axes: [Vec<f64>; 3]) -> [f64; 3] {
     if is_remote(middle, spread) { round_origin(middle, spread) } else { [0.0; 3] }
 }
 
-/// A point rounded to the power of ten below `unit` (1e-15 to 1e15); a number that is not finite becomes 0.
+/// A point rounded to multiples of the power of ten below `unit` (1e-15 to 1e15); a non-finite number becomes 0.
 pub fn round_origin(point: [f64; 3], unit: f64) -> [f64; 3] {
     let exponent = unit.log10().floor().clamp(-15.0, 15.0) as i32;
     let step = 10f64.powi(exponent.abs());

@@ -14,7 +14,7 @@ const MARGIN: f32 = 1e-6;
 /// The index of a quaternion's largest component and, in order, the three others, for the unit quaternion in which
 /// the largest is positive.
 pub(super) fn smallest_three(quat: [f32; 4]) -> (usize, [f32; 3]) {
-    let largest = (1..4).fold(0, |most, i| if quat[i].abs() > quat[most].abs() { i } else { most });
+    let largest = (1..4).fold(0, |max, i| if quat[i].abs() > quat[max].abs() { i } else { max });
     let length = quat.iter().map(|v| v * v).sum::<f32>().sqrt().max(f32::MIN_POSITIVE);
     let unit = 1.0f32.copysign(quat[largest]) / length;
     let mut others = (0..4).filter(|&i| i != largest).map(|i| quat[i] * unit);

@@ -29,7 +29,7 @@ impl Similarity {
         if !matrix.is_finite() || !(1e-30..1e30).contains(&scale) {
             return None;
         }
-        // This division is exact for half turns and quarter turns.
+        // Half turns and quarter turns stay exact.
         let rotation = linear * (1.0 / scale);
         let error = rotation * rotation.transpose() - DMat3::IDENTITY;
         let is_uniform = error.to_cols_array().iter().all(|v| v.abs() < ROUNDING);

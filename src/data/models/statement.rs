@@ -1,4 +1,4 @@
-//! What files state about a model's antialiasing, in addition to its Gaussians.
+//! Statements about a model's antialiasing in files.
 //!
 //! | file | statement |
 //! |---|---|
@@ -20,7 +20,7 @@ use serde_json::Value;
 use crate::error::LoadError;
 use densify_core::antialiasing::Antialiasing;
 
-/// Key of κ in comments of PLY and in `extras` of JSON.
+/// Key of κ in comments of PLY, and in the JSON of SOG (`asset`) and glTF (`extras`).
 pub(super) const KERNEL: &str = "antialiasing";
 
 /// Lines of a PLY header that state an antialiasing; empty for none.

@@ -97,7 +97,7 @@ pub fn is_unfit(error: &io::Error) -> bool {
     error.raw_os_error().is_none() && error.kind() == io::ErrorKind::InvalidInput
 }
 
-/// The smallest format that holds a model; each format is tried in the file `scratch`.
+/// The least exact of the [`compress_formats`] that holds a model; each is tried in the file `scratch`.
 pub fn fitting_format(model: &Gaussians, scratch: &Path) -> &'static Format {
     let fits = |format: &&Format| {
         write_atomically(scratch, |out| format.write(model, out)).is_ok()

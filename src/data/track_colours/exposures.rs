@@ -94,7 +94,7 @@ impl ExposureSpread {
         (spread, gains)
     }
 
-    /// Whether exposures should be learned; `None` if too few tracks or views were measured for a decision.
+    /// True if exposures should be learned; `None` if too few tracks or views were measured for a decision.
     pub fn decision(&self, views: usize) -> Option<bool> {
         let is_enough = self.tracks >= MIN_TRACKS && 2 * self.views > views;
         let differ = self.stops >= MIN_STOPS && self.with_gains <= MAX_UNEXPLAINED * self.alike;

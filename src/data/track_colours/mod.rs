@@ -38,7 +38,7 @@ const SAME_COLOUR: f64 = 4.0;
 /// Fraction of a track's views that count, namely those that differ least.
 const AGREEING: f64 = 0.75;
 
-/// Statistics of the change of track colours with the view.
+/// Statistics of the spreads of all tracks.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Spread {
@@ -46,13 +46,13 @@ pub struct Spread {
     pub tracks: usize,
     /// Fraction of these tracks that lie on a surface.
     pub on_surface: f64,
-    /// Median over the tracks `[1/255]`.
+    /// Median of the tracks' spreads `[1/255]`.
     pub median: f64,
-    /// 90th percentile of the tracks `[1/255]`.
+    /// 90th percentile of the spreads: a tenth of the tracks exceeds it `[1/255]`.
     pub tenth: f64,
-    /// 95th percentile of the tracks `[1/255]`.
+    /// 95th percentile of the spreads: a twentieth of the tracks exceeds it `[1/255]`.
     pub twentieth: f64,
-    /// Root mean square over all tracks `[1/255]`.
+    /// Root mean square of the spreads `[1/255]`.
     pub rms: f64,
 }
 

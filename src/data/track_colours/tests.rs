@@ -112,8 +112,8 @@ fn colours_that_change_with_the_view_need_a_higher_degree() {
 
 #[test]
 fn occlusion_in_a_quarter_of_the_views_is_ignored() {
-    let hidden = |share: usize| {
-        let (tracks, views) = scene(|view, _, v| if view < share { 255.0 - v } else { v });
+    let hidden = |count: usize| {
+        let (tracks, views) = scene(|view, _, v| if view < count { 255.0 - v } else { v });
         measured(&tracks, &views).unwrap().twentieth
     };
     assert!(hidden(2) < 0.75, "{}", hidden(2));

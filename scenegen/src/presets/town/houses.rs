@@ -3,7 +3,7 @@
 use glam::{DVec3, Vec2, dvec3};
 
 use super::materials::{BAYS, Walls};
-use super::{BLOCK, LocalFrame, Town};
+use super::{HALF_BLOCK, LocalFrame, Town};
 use crate::random::Draws;
 
 /// Height of a floor.
@@ -47,7 +47,7 @@ impl Town {
     /// Four houses on each of two sides of a block, with gardens, hedges and trees between them.
     pub(super) fn houses(&mut self, middle: DVec3, draws: &mut Draws) {
         let grass = self.materials.grass;
-        self.level(middle, [BLOCK; 2], [3.25; 2], grass);
+        self.level(middle, [HALF_BLOCK; 2], [3.25; 2], grass);
         for front in [DVec3::Z, DVec3::NEG_Z] {
             let side = LocalFrame::facing(middle, front);
             for plot in 0..4 {
@@ -55,7 +55,7 @@ impl Town {
                 let half = [between(draws, 3.3, 4.2), between(draws, 3.9, 4.6)];
                 let set_back = between(draws, 1.2, 2.4);
                 let place =
-                    LocalFrame::facing(side.at(aside, 0.0, BLOCK - set_back - half[1]), front);
+                    LocalFrame::facing(side.at(aside, 0.0, HALF_BLOCK - set_back - half[1]), front);
                 let floors = 2 + (draws.unit64() * 2.4) as u32;
                 let walls = one_of(draws, &self.materials.houses);
                 let shell = Shell { place, half, floors, walls };
@@ -78,11 +78,11 @@ impl Town {
     /// Two slabs of flats, one on each side of a paved yard with a row of trees.
     pub(super) fn flats(&mut self, middle: DVec3, draws: &mut Draws) {
         let paving = self.materials.paving;
-        self.level(middle, [BLOCK; 2], [6.5; 2], paving);
+        self.level(middle, [HALF_BLOCK; 2], [6.5; 2], paving);
         let way = if draws.unit64() < 0.5 { DVec3::Z } else { DVec3::X };
         for front in [way, -way] {
             let half = [between(draws, 15.0, 17.5), 5.2];
-            let place = LocalFrame::facing(middle + (BLOCK - 1.8 - half[1]) * front, front);
+            let place = LocalFrame::facing(middle + (HALF_BLOCK - 1.8 - half[1]) * front, front);
             let floors = 4 + (draws.unit64() * 3.0) as u32;
             let shell = Shell { place, half, floors, walls: one_of(draws, &self.materials.flats) };
             self.flat(shell, draws);

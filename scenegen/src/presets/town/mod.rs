@@ -29,15 +29,15 @@ use materials::Materials;
 pub(super) const PRESET: Preset = Preset {
     name: "town",
     summary: "streets, houses and trees, from above and from the street; town:4 has 4x4 blocks (1 to 16; default 2)",
-    build: Build::Sized { default: 2, most: 16, build },
+    build: Build::Sized { default: 2, largest: 16, build },
 };
 
 /// Distance between the centre lines of neighbouring streets.
 const PITCH: f64 = 50.0;
 /// Half the width of a street, including pavements.
-const STREET: f64 = 5.5;
+const HALF_STREET: f64 = 5.5;
 /// Half the side of a block.
-const BLOCK: f64 = 0.5 * PITCH - STREET;
+const HALF_BLOCK: f64 = 0.5 * PITCH - HALF_STREET;
 /// Width of the meadow around the town.
 const MEADOW: f64 = 30.0;
 /// Height of the views from above.
@@ -73,9 +73,9 @@ fn build(size: u32, seed: u64) -> Staging {
         let (column, row) = (block % size, block / size);
         let middle = dvec3(street_at(size, column), 0.0, street_at(size, row));
         let middle = middle + 0.5 * PITCH * (DVec3::X + DVec3::Z);
-        let turn = u64::from(block + row / 2) + seed;
+        let use_index = u64::from(block + row / 2) + seed;
         let mut draws = Draws::new(seed, &[0x62_6c6f_636b, u64::from(column), u64::from(row)]);
-        match USES[(turn % USES.len() as u64) as usize] {
+        match USES[(use_index % USES.len() as u64) as usize] {
             Use::Houses => town.houses(middle, &mut draws),
             Use::Flats => town.flats(middle, &mut draws),
             Use::Park => town.park(middle, &mut draws),
@@ -84,7 +84,7 @@ fn build(size: u32, seed: u64) -> Staging {
     town.furnish_streets(size, seed);
     town.plant_meadow(size, seed);
     let blocks = size * size;
-    let edge = street_at(size, size) + STREET;
+    let edge = street_at(size, size) + HALF_STREET;
     let diagonal = 2.0 * (edge + MEADOW) * 2.0_f64.sqrt();
     let rig = Rig {
         kind: RigKind::Survey,
@@ -194,18 +194,18 @@ impl Town {
         for column in 0..=size {
             for row in 0..=size {
                 let at = dvec3(street_at(size, column), 0.0, street_at(size, row));
-                self.level(at, [STREET; 2], [1.0; 2], crossing);
+                self.level(at, [HALF_STREET; 2], [1.0; 2], crossing);
                 if row < size {
                     let middle = at + 0.5 * PITCH * DVec3::Z;
-                    self.level(middle, [STREET, BLOCK], [1.0, 4.0], street);
+                    self.level(middle, [HALF_STREET, HALF_BLOCK], [1.0, 4.0], street);
                 }
                 if column < size {
                     let middle = at + 0.5 * PITCH * DVec3::X;
-                    self.level(middle, [BLOCK, STREET], [4.0, 1.0], street_across);
+                    self.level(middle, [HALF_BLOCK, HALF_STREET], [4.0, 1.0], street_across);
                 }
             }
         }
-        let edge = street_at(size, size) + STREET;
+        let edge = street_at(size, size) + HALF_STREET;
         let (out, half) = (edge + 0.5 * MEADOW, 0.5 * MEADOW);
         for sign in [-1.0, 1.0] {
             let times = [(2.0 * edge + 2.0 * MEADOW) / 12.0, MEADOW / 12.0];

@@ -3,7 +3,7 @@
 use glam::{DVec3, dvec3};
 
 use super::houses::{between, one_of};
-use super::{BLOCK, LocalFrame, MEADOW, PITCH, STREET, Town, street_at};
+use super::{HALF_BLOCK, HALF_STREET, LocalFrame, MEADOW, PITCH, Town, street_at};
 use crate::random::Draws;
 
 /// Distance of parked cars from the street's centre line.
@@ -23,14 +23,14 @@ impl Town {
     /// Lawns, paths around a fountain, and trees.
     pub(super) fn park(&mut self, middle: DVec3, draws: &mut Draws) {
         let (lawn, stone) = (self.materials.park, self.materials.concrete);
-        self.level(middle, [BLOCK; 2], [1.0; 2], lawn);
+        self.level(middle, [HALF_BLOCK; 2], [1.0; 2], lawn);
         self.model.cylinder(middle, middle + 0.5 * DVec3::Y, 2.2, 24, stone);
         self.model.cylinder(middle + 0.5 * DVec3::Y, middle + 2.0 * DVec3::Y, 0.3, 12, stone);
         self.model.sphere(middle + 2.3 * DVec3::Y, 0.55, 2, stone);
         for cell in 0..36_u32 {
             let place = [f64::from(cell % 6) - 2.5, f64::from(cell / 6) - 2.5]
                 .map(|at| 6.0 * at + between(draws, -0.7, 0.7));
-            // No tree stands on the paths around the fountain.
+            // No tree stands near the fountain or on the path around it.
             let out = place[0].hypot(place[1]);
             if draws.unit64() < 0.7 && !(5.5..10.5).contains(&out) && out > 5.5 {
                 self.tree(middle + dvec3(place[0], 0.0, place[1]), [1.5, 2.4], draws);
@@ -65,8 +65,8 @@ impl Town {
         for column in 0..=size {
             for row in 0..=size {
                 let at = dvec3(street_at(size, column), 0.0, street_at(size, row));
-                let parts = [(row < size, DVec3::Z), (column < size, DVec3::X)];
-                for (_, ahead) in parts.into_iter().filter(|(exists, _)| *exists) {
+                let sections = [(row < size, DVec3::Z), (column < size, DVec3::X)];
+                for (_, ahead) in sections.into_iter().filter(|(exists, _)| *exists) {
                     let key = [u64::from(column), u64::from(row), u64::from(ahead.x > 0.0)];
                     let mut draws = Draws::new(seed ^ 0x0073_7472_6565_7473, &key);
                     let street = at + 0.5 * PITCH * ahead;
@@ -107,7 +107,7 @@ impl Town {
     /// Trees around the town.
     pub(super) fn plant_meadow(&mut self, size: u32, seed: u64) {
         let mut draws = Draws::new(seed, &[0x6d65_6164_6f77]);
-        let edge = street_at(size, size) + STREET;
+        let edge = street_at(size, size) + HALF_STREET;
         for front in [DVec3::Z, DVec3::X, DVec3::NEG_Z, DVec3::NEG_X] {
             let side = LocalFrame::facing(DVec3::ZERO, front);
             for tree in 0..3 * size {

@@ -75,7 +75,7 @@ fn a_town_grows_with_its_size_and_is_determined_by_its_seed() {
         let triangles = staging.model.triangles.len() as u32 / blocks;
         assert!((3000..16_000).contains(&triangles), "{triangles} triangles per block");
         let (lo, hi) = staging.model.bounds();
-        let side = PITCH * f64::from(blocks).sqrt() + 2.0 * (STREET + MEADOW);
+        let side = PITCH * f64::from(blocks).sqrt() + 2.0 * (HALF_STREET + MEADOW);
         assert!(((hi - lo).x - side).abs() < 1e-9 && lo.y.abs() < 1e-9, "{lo} to {hi}");
     }
     let bytes = |size, seed| {

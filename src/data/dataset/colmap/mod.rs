@@ -35,8 +35,8 @@ const RENAME: &str = "rename the image and reconstruct the model again";
 /// Largest accepted numbers of images and points.
 const MAX_IMAGES: u64 = 1_000_000;
 const MAX_POINTS: u64 = 1 << 28;
-/// Largest difference between two copies of one pose written by different programs: of an entry of the rotation, and of
-/// the position relative to 1 plus its distance from the origin.
+/// Largest difference between the copies of a pose that two programs wrote: of each entry of the rotation matrix, and
+/// of the camera's position, relative to 1 plus its distance from the origin.
 const SAME_POSE: f64 = 1e-5;
 
 /// One registered image.

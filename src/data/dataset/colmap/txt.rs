@@ -129,8 +129,8 @@ pub(super) fn cameras(path: &Path) -> Result<HashMap<u32, Lens>, LoadError> {
     Ok(cameras)
 }
 
-/// Reads images.txt. An image has two lines, the second of which lists its observations; it may be empty, and some
-/// programs leave it out.
+/// Reads images.txt. An image has two lines. The second one lists its observations; it may be empty, and some programs
+/// leave it out.
 pub(super) fn images(path: &Path) -> Result<Vec<Image>, LoadError> {
     let mut lines = Lines::open(path)?;
     let mut images = Vec::new();

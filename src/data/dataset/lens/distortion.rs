@@ -7,7 +7,8 @@ use super::Projection;
 /// The projection of a lens to a plane, and radial, tangential and thin-prism distortion of that plane (OpenCV, *Camera
 /// Calibration and 3D Reconstruction*; COLMAP, `sensor/models`). Coefficients of 0 have no effect.
 ///
-/// p becomes p·(1 + a₁r² + a₂r⁴ + a₃r⁶ + a₄r⁸) / (1 + b₁r² + b₂r⁴ + b₃r⁶), plus the tangential and thin-prism parts.
+/// p becomes p·(1 + a₁r² + a₂r⁴ + a₃r⁶ + a₄r⁸) / (1 + b₁r² + b₂r⁴ + b₃r⁶), where r = |p|, plus the tangential and
+/// thin-prism shifts.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Distortion {
     /// The projection to the plane, before distortion.

@@ -2,9 +2,9 @@
 //!
 //! A map is injective on a disc if the symmetric part of its Jacobian is positive definite there: on the segment from
 //! one point to another, the image moves strictly in the direction of the segment. On a circle of radius r the radial
-//! part has the eigenvalues q and (r·q)′, where q is the radial factor; the tangential terms p reduce them by at most
-//! 6|p|·r and the thin-prism terms b by at most 2|b|·r. The distortion is therefore invertible up to the first radius
-//! at which the smaller eigenvalue no longer exceeds the total reduction t.
+//! part has the eigenvalues q and (r·q)′, where q is the radial factor; the tangential coefficients p reduce them by at
+//! most 6|p|·r and the thin-prism coefficients c by at most 2|c|·r. The distortion is therefore invertible up to the
+//! first radius at which the smaller eigenvalue no longer exceeds t, the sum of both reductions and [`MIN_EIGENVALUE`].
 //!
 //! With q = N/M, where N and M are polynomials in s = r², the condition is that M, N − t·M and
 //! (N + 2sN′)·M − 2s·N·M′ − t·M² are positive. Each is bounded from below on whole intervals, so that no radius is
@@ -55,8 +55,8 @@ impl Distortion {
         let scaled_slope = |p: &[f64]| -> Vec<f64> {
             (0..).zip(p).map(|(power, c)| 2.0 * f64::from(power) * c).collect()
         };
-        let grows: Vec<f64> = n.iter().zip(scaled_slope(&n)).map(|(a, b)| a + b).collect();
-        let mut slope = product(&grows, &m);
+        let slope_of_rn: Vec<f64> = n.iter().zip(scaled_slope(&n)).map(|(a, b)| a + b).collect();
+        let mut slope = product(&slope_of_rn, &m);
         for (sum, value) in slope.iter_mut().zip(product(&n, &scaled_slope(&m))) {
             *sum -= value;
         }
@@ -89,8 +89,8 @@ fn lower_bound(polynomial: &[f64], from: f64, to: f64) -> f64 {
     let (mut bound, mut power) = (0.0, 1.0);
     for (index, &coefficient) in shifted.iter().enumerate() {
         // The constant counts whatever its sign is; `coefficient.min(0.0)` would hide NaN.
-        let least = if index > 0 && coefficient > 0.0 { 0.0 } else { coefficient };
-        bound += least * power;
+        let smallest = if index > 0 && coefficient > 0.0 { 0.0 } else { coefficient };
+        bound += smallest * power;
         power *= length;
     }
     bound
@@ -109,8 +109,8 @@ mod tests {
             for length in [1.0, 0.1, 1e-4] {
                 let bound = lower_bound(&p, from, from + length);
                 let values = (0..=100).map(|i| value(from + length * f64::from(i) / 100.0));
-                let least = values.fold(f64::INFINITY, f64::min);
-                assert!(bound <= least + 1e-12 && bound > least - 10.0 * length, "{from} {length}");
+                let min = values.fold(f64::INFINITY, f64::min);
+                assert!(bound <= min + 1e-12 && bound > min - 10.0 * length, "{from} {length}");
             }
         }
         assert!(lower_bound(&[1.0, f64::NAN], 0.0, 1.0).is_nan());
@@ -157,8 +157,8 @@ mod tests {
                 let p = r * glam::DVec2::from_angle(std::f64::consts::TAU * turn);
                 let j = distortion.jacobian(p);
                 let (a, b, c) = (j.x_axis.x, 0.5 * (j.x_axis.y + j.y_axis.x), j.y_axis.y);
-                let least = 0.5 * (a + c) - (0.25 * (a - c) * (a - c) + b * b).sqrt();
-                assert!(least > 0.0, "{distortion:?} at {p}: {least}");
+                let eigenvalue = 0.5 * (a + c) - (0.25 * (a - c) * (a - c) + b * b).sqrt();
+                assert!(eigenvalue > 0.0, "{distortion:?} at {p}: {eigenvalue}");
             }
         }
     }

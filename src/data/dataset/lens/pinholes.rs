@@ -32,8 +32,8 @@ pub(crate) enum PinholeError {
     NothingVisible,
 }
 
-/// Samples along a side of the photograph. Between two samples, a border that bulges by 100 px over the whole side
-/// deviates from a straight line by 100 px · (1/64)², less than 0.03 px.
+/// Intervals between samples along a side of the photograph. Within one, a border that bulges by 100 px over the whole
+/// side deviates from a straight line by 100 px · (1/64)², less than 0.03 px.
 const SAMPLES: u32 = 64;
 /// Cells along each side of a face that are tested for visibility.
 const CELLS: usize = 128;

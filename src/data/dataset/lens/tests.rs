@@ -137,7 +137,7 @@ fn every_lens_model_round_trips_a_grid() {
             let back = lens.project(ray).unwrap_or(DVec2::INFINITY);
             worst = worst.max(back.distance(pixel));
         }
-        // The other way, over the invertible field of view: only rounding errors remain.
+        // From rays to pixels and back, over the invertible field of view: only rounding errors remain.
         let half = 0.5 * lens.usable_field().to_radians();
         for (i, j) in (0..=80).flat_map(|i| (0..48).map(move |j| (i, j))) {
             let angle = half * f64::from(i) / 80.001;

@@ -260,7 +260,7 @@ fn damaged_archives_are_refused() {
     let at = other.windows(9).position(|w| w == b"# cameras").unwrap();
     other[at + 3] ^= 1;
     refused("a checksum", &other, "sparse/0/cameras.txt, cannot be unpacked");
-    // Truncation at any place.
+    // Truncation at many places.
     for kept in (0..whole.len()).step_by(97) {
         let archive = Packed::new(&whole[..kept]);
         let message = archive.load().unwrap_err().to_string();

@@ -109,7 +109,7 @@ fn faults_of_colmap_text_files_are_named() {
             ),
             ("not UTF-8", |m| m.patch("sparse/0/points3D.txt", |b| b[20] = 0xff), "points3D.txt"),
             (
-                "a name",
+                "a name that is not UTF-8",
                 |m| {
                     m.patch("sparse/0/images.txt", |b| {
                         *b.iter_mut().rfind(|b| **b == b'p').unwrap() = 0xff
@@ -174,7 +174,7 @@ fn faults_of_colmap_binary_files_are_named() {
     }
 }
 
-/// With any single byte damaged, loading returns a dataset or an error.
+/// Whichever of the first 200 bytes of a file is damaged, loading returns a dataset or an error.
 #[test]
 fn no_damaged_byte_causes_a_panic() {
     let made = Made::colmap_bin();

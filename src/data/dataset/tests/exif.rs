@@ -64,7 +64,8 @@ fn reported(made: &Made) -> ReportedExposures {
 
 #[test]
 fn exposures_are_reported_in_stops() {
-    // The second has twice the time; the third has a quarter of it, half the f-number and twice the sensitivity.
+    // Compared with the first photograph, the second has twice the exposure time; the third has a quarter of the time,
+    // half the f-number and twice the sensitivity.
     let found = reported(&shot([
         Some(((1, 100), (4, 1), 100)),
         Some(((1, 50), (4, 1), 100)),
@@ -168,7 +169,7 @@ fn write_turned_image(made: &Made, orientation: Option<u16>) {
 }
 
 #[test]
-fn a_photograph_that_lies_on_its_side_compared_with_its_camera_is_turned() {
+fn a_photograph_that_fits_its_camera_only_after_a_quarter_turn_is_turned() {
     // Orientation 6 is a quarter turn clockwise, so that the upper side comes to the right; 8 is the opposite turn; 5
     // and 7 are also mirrored.
     let (upper, lower) = ([255, 0, 0], [0, 0, 255]);

@@ -73,7 +73,7 @@ fn views_of_one_photograph_share_its_file_and_split() {
     assert_eq!(names(&data.train), faces("b.png"));
     assert_eq!(names(&data.test), [faces("a.png"), faces("c.png")].concat());
     assert_noted(&data, "3 photographs, 5 views");
-    // All views are from one place, at right angles to the front.
+    // All views are from one place, and the others look at right angles to the front view.
     let front = &data.train[0].camera;
     for view in &data.train[1..] {
         assert!(view.camera.centre().distance(front.centre()) < 1e-12);

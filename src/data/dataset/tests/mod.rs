@@ -41,7 +41,7 @@ fn assert_noted(data: &Dataset, words: &str) {
     assert!(data.notes.iter().any(is_noted), "{words}: {:?}", data.notes);
 }
 
-/// Writes a mask with these weights by column, for an upright photograph.
+/// Writes a mask of the photographs' usual size, with these weights by column.
 fn write_mask(path: &Path, weight: impl Fn(u32) -> u8) {
     std::fs::create_dir_all(path.parent().unwrap()).unwrap();
     image::GrayImage::from_fn(SIZE.0, SIZE.1, |x, _| [weight(x)].into()).save(path).unwrap();

@@ -207,7 +207,7 @@ fn paths_of_any_system_are_found_by_suffix() {
         std::fs::create_dir(made.file("moved")).unwrap();
         refused("phones", &made, &with_images(), words);
     }
-    // Other formats.
+    // Other formats match suffixes, too.
     let colmap = Made::colmap_txt();
     colmap.replace("sparse/0/images.txt", "b.png", "C:/walk/b.png");
     let table = Made::realitycapture();

@@ -1,4 +1,4 @@
-//! Real datasets load: tests of the folder `DENSIFY_SHARED`, or `../shared`.
+//! Tests that load real datasets from the folder `DENSIFY_SHARED` or, if it is not set, `../shared`.
 
 use super::super::*;
 use densify_fixtures::shared;

@@ -113,8 +113,8 @@ fn row<'a>(words: [u32; 4], bounds: &[f32], sh: &'a mut [f32]) -> Row<'a> {
 
 /// The lowest `bits` bits of a word as a fraction of their largest value.
 fn share(word: u32, bits: u32) -> f32 {
-    let most = (1u32 << bits) - 1;
-    (word & most) as f32 / most as f32
+    let max = (1u32 << bits) - 1;
+    (word & max) as f32 / max as f32
 }
 
 /// Three fractions of 11, 10 and 11 bits.

@@ -119,8 +119,8 @@ impl CompressedPlyWriter {
         for row in &self.current {
             let share = |axis: usize| {
                 let at = axis / 3 * 6 + axis % 3;
-                let (least, most) = (bounds[at], bounds[at + 3]);
-                if most > least { (row[axis] - least) / (most - least) } else { 0.0 }
+                let (min, max) = (bounds[at], bounds[at + 3]);
+                if max > min { (row[axis] - min) / (max - min) } else { 0.0 }
             };
             let three = |at: usize| {
                 bits(share(at), 11) << 21 | bits(share(at + 1), 10) << 11 | bits(share(at + 2), 11)
@@ -142,8 +142,8 @@ fn band(value: f32) -> u8 {
 
 /// A fraction quantised to `bits` bits.
 fn bits(share: f32, bits: u32) -> u32 {
-    let most = ((1u32 << bits) - 1) as f32;
-    (share.clamp(0.0, 1.0) * most).round() as u32
+    let max = ((1u32 << bits) - 1) as f32;
+    (share.clamp(0.0, 1.0) * max).round() as u32
 }
 
 /// The index of the largest component, then ten bits for each of the others, from −1/√2 to 1/√2.

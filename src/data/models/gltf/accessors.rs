@@ -71,9 +71,9 @@ impl Buffers<'_> {
             return Err(wrong("sparse accessors, and those without data, are not read"));
         };
         let bytes = self.view(view)?.get(accessor.byte_offset..).unwrap_or_default();
-        let scale = |most: f32| if accessor.normalized { 1.0 / most } else { 1.0 };
+        let scale = |largest: f32| if accessor.normalized { 1.0 / largest } else { 1.0 };
         // The smallest signed integer is one step below −1 when normalised (glTF 2.0, section 3.11).
-        let least = if accessor.normalized { -1.0 } else { f32::NEG_INFINITY };
+        let min = if accessor.normalized { -1.0 } else { f32::NEG_INFINITY };
         let size = match accessor.component_type {
             5120 | 5121 => 1,
             5122 | 5123 => 2,
@@ -81,9 +81,9 @@ impl Buffers<'_> {
             _ => return Err(wrong("its numbers must be floats, bytes or shorts")),
         };
         let number = |bytes: &[u8]| match (accessor.component_type, bytes) {
-            (5120, &[a]) => (f32::from(a as i8) * scale(127.0)).max(least),
+            (5120, &[a]) => (f32::from(a as i8) * scale(127.0)).max(min),
             (_, &[a]) => f32::from(a) * scale(255.0),
-            (5122, &[a, b]) => (f32::from(i16::from_le_bytes([a, b])) * scale(32_767.0)).max(least),
+            (5122, &[a, b]) => (f32::from(i16::from_le_bytes([a, b])) * scale(32_767.0)).max(min),
             (_, &[a, b]) => f32::from(u16::from_le_bytes([a, b])) * scale(65_535.0),
             (_, bytes) => f32::from_le_bytes(std::array::from_fn(|i| bytes[i])),
         };

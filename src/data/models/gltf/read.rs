@@ -238,11 +238,11 @@ fn splats(
         return Err(LoadError::damaged(path, "attributes", "they have different counts"));
     }
     // Many exporters copy the numbers of a splat PLY.
-    for (name, values, most, cause) in [
+    for (name, values, max, cause) in [
         ("SCALE", &scales, f32::INFINITY, "a logarithm; glTF stores scales"),
         ("OPACITY", &opacities, MAX_OPACITY, "a logit; glTF stores opacities"),
     ] {
-        if let Some(value) = values.iter().find(|value| **value < 0.0 || **value > most) {
+        if let Some(value) = values.iter().find(|value| **value < 0.0 || **value > max) {
             let problem = format!("{value} looks like {cause} as they are");
             return Err(LoadError::damaged(path, format!("{SPLATS}:{name}"), problem));
         }

@@ -99,13 +99,13 @@ impl ModelWriter for GlbWriter {
 
 impl GlbWriter {
     fn document(&self) -> Value {
-        let standard = |name: &str| match name {
+        let full_name = |name: &str| match name {
             "POSITION" | LOG_SCALE | OPACITY_LOGIT => name.to_owned(),
             name => format!("{SPLATS}:{name}"),
         };
         let colours =
             (0..=self.sh_degree).flat_map(|l| (0..=2 * l).map(move |n| coefficient(l, n)));
-        let names = ATTRIBUTES.iter().map(|(name, _)| standard(name)).chain(colours);
+        let names = ATTRIBUTES.iter().map(|(name, _)| full_name(name)).chain(colours);
         let widths = ATTRIBUTES.iter().map(|(_, width)| *width).chain(std::iter::repeat(3));
         let (mut views, mut accessors, mut offset) = (Vec::new(), Vec::new(), 0);
         let mut attributes = serde_json::Map::new();

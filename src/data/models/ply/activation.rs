@@ -15,12 +15,12 @@ const SPREAD: f32 = 0.25;
 /// doubtful ones.
 pub(super) fn undo(model: &mut Gaussians) -> Vec<String> {
     let (faintest, most_opaque) = range(&model.opacity_logits);
-    let (least, most) = range(model.log_scales.as_flattened());
+    let (smallest, largest) = range(model.log_scales.as_flattened());
     let may_be_opacities = faintest >= 0.0 && most_opaque > 0.0 && most_opaque <= 1.0;
     let are_opacities =
         may_be_opacities && most_opaque > NEAR_OPAQUE && most_opaque - faintest > SPREAD;
-    let varies = least < most || (are_opacities && most > 0.0);
-    let are_scales = least >= 0.0 && varies && !are_logarithms(model);
+    let varies = smallest < largest || (are_opacities && largest > 0.0);
+    let are_scales = smallest >= 0.0 && varies && !are_logarithms(model);
     let mut notes = Vec::new();
     if are_opacities || (may_be_opacities && are_scales) {
         for value in &mut model.opacity_logits {
@@ -43,7 +43,7 @@ pub(super) fn undo(model: &mut Gaussians) -> Vec<String> {
         notes.push(format!(
             "its scales may be standard deviations instead of logarithms: none is negative, so every Gaussian is read as \
              larger than {:.3}; if they are standard deviations, export their logarithms",
-            least.exp()
+            smallest.exp()
         ));
     }
     notes
@@ -64,5 +64,5 @@ fn are_logarithms(model: &Gaussians) -> bool {
 /// The smallest and the largest value.
 fn range(values: &[f32]) -> (f32, f32) {
     let start = (f32::INFINITY, f32::NEG_INFINITY);
-    values.iter().fold(start, |(least, most), &value| (least.min(value), most.max(value)))
+    values.iter().fold(start, |(min, max), &value| (min.min(value), max.max(value)))
 }

@@ -11,7 +11,7 @@ use densify_core::gaussians::{Gaussians, sigmoid};
 /// One splat in ASCII and in big endian. Its properties are shuffled, have other types, are mixed with unknown ones and
 /// a list, and follow another element.
 #[test]
-fn other_layouts_read_the_same() {
+fn properties_may_have_any_order_and_type() {
     let properties = "property double rot_3\nproperty double rot_0\nproperty list uchar short extra\nproperty double rot_1\n\
         property double rot_2\nproperty int x\nproperty float label\nproperty double y\nproperty double z\nproperty double opacity\n\
         property double scale_2\nproperty double scale_1\nproperty double scale_0\nproperty double f_dc_2\n\
@@ -100,7 +100,7 @@ fn activated_values_are_recognised() {
     let scales = |m: &mut Gaussians| {
         m.log_scales.as_flattened_mut().iter_mut().for_each(|v| *v = v.exp());
     };
-    let millimetres = |m: &mut Gaussians| {
+    let small_unit = |m: &mut Gaussians| {
         m.means.as_flattened_mut().iter_mut().for_each(|v| *v *= 1e4);
         m.log_scales.as_flattened_mut().iter_mut().for_each(|v| *v += 10.0_f32.ln() * 4.0);
     };
@@ -110,13 +110,13 @@ fn activated_values_are_recognised() {
     type Change<'a> = &'a dyn Fn(&mut Gaussians);
     let cases: [(&str, &[Change<'_>], bool, &[&str]); 9] = [
         ("as it is", &[], false, &[]),
-        ("in millimetres", &[&millimetres], false, &[]),
+        ("in a small unit", &[&small_unit], false, &[]),
         ("opacities", &[&opacities], true, &["opacities"]),
         ("scales", &[&scales], false, &["export their logarithms"]),
         ("both", &[&opacities, &scales], true, &["opacities", "not as logarithms"]),
         (
-            "both in millimetres",
-            &[&millimetres, &opacities, &scales],
+            "both in a small unit",
+            &[&small_unit, &opacities, &scales],
             true,
             &["opacities", "scales"],
         ),

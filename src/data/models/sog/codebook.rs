@@ -14,17 +14,17 @@ pub(super) struct Codebook(Vec<f32>);
 impl Codebook {
     /// Fits a codebook to finite values; `weight` gives the weight of a value by its index.
     pub(super) fn fit(values: &[f32], weight: impl Fn(usize) -> f32) -> Self {
-        let least = values.iter().copied().fold(f32::INFINITY, f32::min);
-        let most = values.iter().copied().fold(f32::NEG_INFINITY, f32::max);
+        let min = values.iter().copied().fold(f32::INFINITY, f32::min);
+        let max = values.iter().copied().fold(f32::NEG_INFINITY, f32::max);
         // All values are equal, or there are none.
-        if most <= least {
-            return Self(vec![least; ENTRIES]);
+        if max <= min {
+            return Self(vec![min; ENTRIES]);
         }
-        let (least, extent) = (f64::from(least), f64::from(most) - f64::from(least));
-        // Weight, and weight times value.
+        let (min, extent) = (f64::from(min), f64::from(max) - f64::from(min));
+        // The sum of the weights of each bin's values, and the sum of weight times value.
         let mut bins = vec![[0.0f64; 2]; BINS];
         for (index, &value) in values.iter().enumerate() {
-            let bin = ((f64::from(value) - least) / extent * BINS as f64) as usize;
+            let bin = ((f64::from(value) - min) / extent * BINS as f64) as usize;
             let weight = f64::from(weight(index));
             let bin = &mut bins[bin.min(BINS - 1)];
             *bin = [bin[0] + weight, bin[1] + weight * f64::from(value)];
@@ -37,10 +37,10 @@ impl Codebook {
         for (bin, share) in density.iter().enumerate() {
             sum += share;
             while sum > (book.len() as f64 + 0.5) / ENTRIES as f64 * total && book.len() < ENTRIES {
-                book.push(least + (bin as f64 + 0.5) / BINS as f64 * extent);
+                book.push(min + (bin as f64 + 0.5) / BINS as f64 * extent);
             }
         }
-        book.resize(ENTRIES, least + extent);
+        book.resize(ENTRIES, min + extent);
         for _ in 0..ITERATIONS {
             if !improve(&mut book, &bins) {
                 break;
@@ -104,7 +104,7 @@ mod tests {
         let book = Codebook::fit(&many, |_| 1.0);
         let error = |&v: &f32| (book.values()[usize::from(book.nearest(v))] - v).powi(2);
         let rms = (many.iter().map(error).sum::<f32>() / many.len() as f32).sqrt();
-        // The least possible mean square, (∫∛density)³/12/256² (Panter and Dite), is 0.0019²; even spacing has
+        // The smallest possible mean square, (∫∛density)³/12/256² (Panter and Dite), is 0.0019²; even spacing has
         // 0.00226².
         assert!(rms < 0.001_95, "{rms}");
     }

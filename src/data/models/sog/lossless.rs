@@ -94,7 +94,7 @@ pub(super) fn encode(rgba: &[u8], (width, height): (usize, usize)) -> Vec<u8> {
     }
     if let Some(predictor) = transforms.predictor {
         to.put(1, 3);
-        // One predictor for all blocks of 512 pixels: an image with a pixel per block, whose green channel is the
+        // One predictor for all blocks of 512 x 512 pixels: an image with a pixel per block, whose green channel is the
         // predictor's number, without a colour cache.
         to.put(0b111, 3);
         to.put(0, 1);
@@ -343,9 +343,9 @@ mod tests {
         while counts.len() < 40 {
             counts.push(counts[counts.len() - 1] + counts[counts.len() - 2]);
         }
-        for most in [7, 15] {
-            let lengths = code_lengths(&counts, most);
-            assert!(lengths.iter().all(|length| (1..=most).contains(length)), "{lengths:?}");
+        for max in [7, 15] {
+            let lengths = code_lengths(&counts, max);
+            assert!(lengths.iter().all(|length| (1..=max).contains(length)), "{lengths:?}");
             let words: f64 = lengths.iter().map(|&length| 0.5_f64.powi(length.into())).sum();
             assert!((words - 1.0).abs() < 1e-12, "{lengths:?}");
         }
@@ -360,7 +360,7 @@ mod tests {
             [wave(50.0), noise(at), wave(37.0), 255]
         };
         let bytes = encoded_length(100, 100, pixel);
-        // Noise takes a byte; gradients of −4 to 4 in the other channels take at most three bits.
+        // Noise takes a byte per pixel; differences of −4 to 4 in the two other channels take three bits at most.
         assert!(bytes < 10_000 + 2 * 10_000 * 3 / 8 + 1_000, "{bytes}");
     }
 }

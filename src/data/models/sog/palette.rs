@@ -25,7 +25,7 @@ struct Cluster {
 }
 
 /// Upper bound on the memory that a fit takes for each row of `width` numbers `[bytes]`: the ordered list, clusters,
-/// entries and labels.
+/// entries, labels and sides.
 pub(super) fn row_bytes(width: usize) -> usize {
     4 + size_of::<Cluster>() + 4 * width + 4 + 1
 }
@@ -120,11 +120,11 @@ impl Rows<'_> {
         sides.clear();
         sides.extend(rows.iter().map(|&row| f64::from(self.row(row)[axis]) > mean[axis]));
         for _ in 0..ITERATIONS {
-            let part = |side: bool| {
+            let mean_of = |side: bool| {
                 let members = rows.iter().zip(&*sides).filter(|(_, high)| **high == side);
                 self.mean(&members.map(|(&row, _)| row).collect::<Vec<_>>())
             };
-            let (low, high) = (part(false), part(true));
+            let (low, high) = (mean_of(false), mean_of(true));
             // A plane separates the points nearer to one mean from those nearer to the other.
             let normal: Vec<f32> = low.iter().zip(&high).map(|(l, h)| (h - l) as f32).collect();
             let middle =

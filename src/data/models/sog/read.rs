@@ -100,7 +100,7 @@ pub(super) fn is_meta(text: &str) -> bool {
 /// Reads an archive, or the images beside `meta.json`.
 ///
 /// # Errors
-/// When the archive or an image is unreadable or damaged, contradicts `meta.json`, or its name leads out of the folder.
+/// When the archive or an image is unreadable or damaged, or an image contradicts `meta.json` or is outside the folder.
 pub(super) fn read(file: ModelFile<'_>) -> Result<SplatFile, LoadError> {
     let path = file.path;
     if let Some(text) = file.json()? {

@@ -102,7 +102,7 @@ impl ModelWriter for SogWriter {
 
     fn finish(&mut self, out: &mut dyn Write) -> io::Result<()> {
         let rows = self.means.len();
-        self.level_weights();
+        self.normalise_weights();
         let (width, height) = image_size(rows);
         let picture = || Picture::new(width, height);
         let mut archive = ZipWriter::new(out);
@@ -205,8 +205,8 @@ impl SogWriter {
         self.sharing.map_or(1 << rows.ilog2(), |sharing| rows.div_ceil(sharing)).min(MAX_PALETTE)
     }
 
-    /// Keeps the weights within a factor of a hundred of their mean, because they are only estimates.
-    fn level_weights(&mut self) {
+    /// Divides the weights by their mean, and limits them to 0.01..=100, because they are only estimates.
+    fn normalise_weights(&mut self) {
         let finite = |weight: f32| if weight.is_finite() { weight } else { 0.0 };
         let mean = self.weights.iter().map(|&w| f64::from(finite(w))).sum::<f64>();
         let mean = (mean / self.weights.len().max(1) as f64).max(1e-30) as f32;
@@ -216,7 +216,7 @@ impl SogWriter {
     }
 }
 
-/// Three components from −1/√2 to 1/√2, in the order (w, x, y, z), and the tag of the largest.
+/// Three components from −1/√2 to 1/√2, in the order (w, x, y, z), and the alpha that names the largest.
 fn quaternion(quat: [f32; 4]) -> [u8; 4] {
     let (largest, others) = smallest_three(quat);
     let byte = |v: f32| (127.5 * (v * std::f32::consts::SQRT_2 + 1.0)).round() as u8;

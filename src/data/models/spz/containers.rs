@@ -13,7 +13,8 @@ pub(super) type Array<'a> = (usize, &'a dyn Fn(&mut dyn Write) -> io::Result<()>
 
 /// Upper bound on the memory of the gzip encoder, with its window, tables and buffer `[bytes]`; 0.35 MiB were measured.
 pub(super) const GZIP_MEMORY: u64 = 1 << 19;
-/// The same for zstd `[bytes]`: the current and the previous block of 128 KiB, each with a table of its strings.
+/// Upper bound on the memory of the zstd encoder `[bytes]`: the current and the previous block of 128 KiB, each with a
+/// table of its strings.
 const ZSTD_MEMORY: u64 = 4 << 20;
 
 /// Upper bound on the memory that [`write_frames`] takes for arrays of these sizes `[bytes]`: all frames, and the

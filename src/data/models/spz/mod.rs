@@ -1,8 +1,8 @@
 //! SPZ (Niantic), a quantised and compressed format. Versions 2 to 4 are read; version 3, which every reader accepts,
 //! is written by default, and version 4 by choice.
 //!
-//! Coordinates are used as stored, as in splat-transform, because most files do not state their axes. If a file does,
-//! they are converted.
+//! Coordinates are converted if the file states their axes. Most files do not; their coordinates are used as stored, as
+//! in splat-transform.
 
 mod containers;
 mod extensions;

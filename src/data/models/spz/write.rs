@@ -145,7 +145,7 @@ impl SpzWriter {
 
     /// Fractional bits that leave room for all positions and move no Gaussian visibly.
     fn fractional_bits(&mut self) -> io::Result<u8> {
-        let reach = self.positions.as_flattened().iter().fold(0f32, |most, v| most.max(v.abs()));
+        let reach = self.positions.as_flattened().iter().fold(0f32, |max, v| max.max(v.abs()));
         let room = POSITION_BITS - 1 - reach.max(1e-6).log2().floor() as i32;
         if room < 0 {
             return Err(unfit(format!(

@@ -45,15 +45,15 @@ fn rounding_does_not_count_as_a_change() {
 fn values_that_a_format_cannot_hold_count_as_changes() {
     type Change = fn(&mut Gaussians);
     let cases: [(&str, Change, &[&str], &str); 9] = [
-        ("kilometres", |m| grow(m, -8.0), &LOSSY[..2], "scales"),
-        ("tenths", |m| grow(m, 11.0), &LOSSY[..2], "scales"),
-        ("haze", |m| m.opacity_logits.fill(-5.0), &LOSSY, "opacities"),
+        ("tiny", |m| grow(m, -8.0), &LOSSY[..2], "scales"),
+        ("huge", |m| grow(m, 11.0), &LOSSY[..2], "scales"),
+        ("faint", |m| m.opacity_logits.fill(-5.0), &LOSSY, "opacities"),
         ("bright", |m| colour(m, 0, 6.0), &LOSSY[..2], "colours"),
-        ("glossy", |m| colour(m, 4, 2.0), &LOSSY[..2], "colours"),
-        ("mirror", |m| colour(m, 4, 6.0), &["spz", "compressed-ply"], "colours"),
-        ("far", |m| m.means[7][1] = 1e6, &LOSSY[..2], "positions"),
+        ("view-dependent", |m| colour(m, 4, 2.0), &LOSSY[..2], "colours"),
+        ("strongly view-dependent", |m| colour(m, 4, 6.0), &["spz", "compressed-ply"], "colours"),
+        ("one far Gaussian", |m| m.means[7][1] = 1e6, &LOSSY[..2], "positions"),
         ("UTM", |m| m.means.iter_mut().for_each(|mean| mean[1] += 5e5), &["sog"], "positions"),
-        ("glare", |m| m.sh[0] = 1e7, &["sog"], "colours"),
+        ("one glaring Gaussian", |m| m.sh[0] = 1e7, &["sog"], "colours"),
     ];
     for (case, change, unfit, quantity) in cases {
         let mut model = trained();

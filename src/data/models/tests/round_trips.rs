@@ -47,7 +47,7 @@ fn in_order(model: &Gaussians) -> Gaussians {
 /// Largest errors of position, logarithm of scale, opacity, colour, and of a quaternion's component.
 fn errors(a: &Gaussians, b: &Gaussians) -> [f32; 5] {
     assert_eq!((a.len(), a.sh_degree), (b.len(), b.sh_degree));
-    let most =
+    let largest =
         |x: &[f32], y: &[f32]| x.iter().zip(y).map(|(x, y)| (x - y).abs()).fold(0.0, f32::max);
     let opacities =
         |m: &Gaussians| m.opacity_logits.iter().map(|&x| sigmoid(x)).collect::<Vec<_>>();
@@ -58,10 +58,10 @@ fn errors(a: &Gaussians, b: &Gaussians) -> [f32; 5] {
         [0, 1, 2, 3].map(|i| (p[i] / length(p) - sign * q[i] / length(q)).abs())
     });
     [
-        most(a.means.as_flattened(), b.means.as_flattened()),
-        most(a.log_scales.as_flattened(), b.log_scales.as_flattened()),
-        most(&opacities(a), &opacities(b)),
-        most(&a.sh, &b.sh),
+        largest(a.means.as_flattened(), b.means.as_flattened()),
+        largest(a.log_scales.as_flattened(), b.log_scales.as_flattened()),
+        largest(&opacities(a), &opacities(b)),
+        largest(&a.sh, &b.sh),
         quats.fold(0.0, f32::max),
     ]
 }

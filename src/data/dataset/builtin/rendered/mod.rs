@@ -29,7 +29,7 @@ const BUILD_FACTOR: u64 = 4;
 #[derive(Debug, PartialEq)]
 struct Rendered {
     summary: Summary,
-    /// The images of all views, in order.
+    /// The images of all views, in the order of `summary.views`.
     frames: Vec<Frame>,
     points: InitPoints,
 }
