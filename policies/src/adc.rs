@@ -97,9 +97,9 @@ pub fn concave_curve(window: Window, step: u32, start: usize, end: usize) -> usi
     if every == 0 {
         return start;
     }
-    let events = (until.saturating_sub(from) / every).max(1);
-    let event = (step / every).saturating_sub(from / every);
-    let progress = (f64::from(event) / f64::from(events)).min(1.0);
+    let intervals = (until.saturating_sub(from) / every).max(1);
+    let passed = (step / every).saturating_sub(from / every);
+    let progress = (f64::from(passed) / f64::from(intervals)).min(1.0);
     let (start, end) = (start as f64, end as f64);
     (start + (end - start) * (2.0 * progress - progress * progress)).floor() as usize
 }
@@ -189,7 +189,7 @@ impl PruneLimits {
     }
 
     /// True if a Gaussian of this opacity and largest standard deviation `[scene units]` is to be pruned.
-    /// Non-finite values always are, as training cannot repair them.
+    /// Gaussians with non-finite values always are, as training cannot repair them.
     pub fn exceeded(&self, opacity: f32, scale: f32) -> bool {
         !(opacity.is_finite() && scale.is_finite())
             || opacity < self.min_opacity
@@ -208,8 +208,8 @@ impl PruneLimits {
     }
 }
 
-/// If `dead` lists every row, removes the most opaque one (the first of equals) from the list: an empty
-/// model could never grow again.
+/// If `dead` lists every row, removes the most opaque one from the list (the first of several): an empty model
+/// could never grow again.
 pub fn spare_one(dead: &mut Vec<u32>, opacity: &[f32]) {
     if dead.len() == opacity.len() {
         let spared = top_k(opacity, 1);

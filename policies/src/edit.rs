@@ -1,4 +1,4 @@
-//! The kinds of edits: children of a parent, rows rewritten in place, rows without a parent, resets.
+//! The kinds of edits: children of a parent, rows rewritten in place, rows without a parent, decay, resets.
 //!
 //! The file is long because the types belong together; most lines are their documentation.
 

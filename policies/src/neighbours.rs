@@ -30,7 +30,7 @@ struct Nearest<'a> {
     at: [f64; 3],
     /// Index of the point, which is not its own neighbour.
     point: u32,
-    /// Neighbours found so far, nearest first, followed by [`NOT_FOUND`]. Not empty.
+    /// Neighbours found so far, nearest first, followed by [`NOT_FOUND`]. At least one element.
     found: &'a mut [Neighbour],
     /// Only neighbours below this squared distance are of interest.
     bound: f64,

@@ -1,6 +1,6 @@
-//! Random numbers without state: every draw is a hash of (seed, step, row, purpose).
+//! Random numbers without state: every draw is a hash of (seed, step, row, purpose, counter).
 //!
-//! The same four numbers give the same bits on every backend, in any order and at any thread
+//! The same five numbers give the same bits on every backend, in any order and at any thread
 //! count. The hash is pcg4d (Jarzynski and Olano, *Hash Functions for GPU Rendering*, JCGT 9(3),
 //! 2020): 32-bit operations only, so that a shader can compute it too.
 

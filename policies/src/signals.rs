@@ -109,7 +109,7 @@ signals! {
     WeightSum: Sum "pixels" [Weight];
     /// Number of pixels the row was blended into, >= 0.
     PixelCount: Count "pixels" [Count];
-    /// Sum over all pixels of α·T·e, >= 0, where e is the pixel's part of the training loss:
+    /// Sum over all pixels of α·T·e, >= 0, where e is the pixel's contribution to the training loss:
     /// 0.8·|I − G| + 0.2·(1 − SSIM), averaged over channels. Divided by
     /// [`WeightSum`](Self::WeightSum) it is the mean error where the row is visible. The error map and pixel
     /// weights of [`Needs::error_score`](crate::policy::Needs::error_score) apply to this sum, too.

@@ -35,7 +35,7 @@
 //!   code its mask could rise again in principle, although only the loss term acts on it.
 //! - The paper also replaces colours by a grid with a small network and quantises shapes. Neither is part
 //!   of density control.
-//! - The last Gaussian is never pruned.
+//! - At least one Gaussian is always kept.
 //!
 //! ## Parameters
 //!

@@ -66,6 +66,7 @@ enum Fault {
     UpdatesUndeclared,
 }
 
+/// The faults, each with the check that finds it.
 const FAULTS: [(Fault, Option<Check>); 28] = [
     (Fault::None, None),
     (Fault::ReadsUndeclared, Some(Check::ReadsOnlyDeclared)),
@@ -334,6 +335,7 @@ struct Lax {
     threshold: f64,
 }
 
+/// A policy that cannot be built for a run of 7 steps.
 struct Unbuildable;
 
 impl ConfiguredPolicy for Unbuildable {

@@ -89,7 +89,7 @@ fn event_quotas_add_up_to_the_share() {
 }
 
 #[test]
-fn pruned_slots_and_room_are_used_before_rows_are_evicted() {
+fn rows_are_evicted_only_if_pruning_leaves_too_little_room() {
     // 19 rows, one dead, budget 20: there is room for 2, and eviction makes room for 2 more.
     let mut opacity = [0.5; 19];
     opacity[7] = 0.0049;
@@ -156,6 +156,7 @@ fn fresh_views_are_rendered_if_rows_may_be_evicted() {
     assert_eq!([95, 96, 100].map(|rows| wants(10_500, rows)), [false, true, true]);
     // Pruning acts only on models above the budget.
     assert_eq!([100, 101].map(|rows| wants(650, rows)), [false, true]);
+    // Growth and an insertion of 5 rows fall on one step: 48 + 48 + 5 is above the budget of 100.
     let both = build("diet", "importance = \"fresh\"\nrho_c = 1.4\ncompensate_from = 500", &scene);
     assert_eq!([47, 48].map(|rows| both.aux_views(1000, rows, 100)), [0, 100]);
     // Replacing the model renders all views.

@@ -42,7 +42,7 @@
 //!   between four pixels and skips the others. They are never downscaled below 16 pixels a side.
 //! - The code's own defaults are a different configuration: `prune_every` = 3000, `prune_share` = 0.05,
 //!   `prune_until` = 24000, `vanilla`'s defaults for growth, and full-size images (`whole_from` = 0).
-//! - The last Gaussian is never pruned.
+//! - At least one Gaussian is always kept.
 //!
 //! ## Parameters
 //!

@@ -1,6 +1,6 @@
 //! # igs — long-axis splits at image edges
 //!
-//! Splits Gaussians along their longest axis, those at image edges first, so that the number of
+//! Splits Gaussians along their longest axis, preferably those at image edges, so that the number of
 //! Gaussians follows a square-root curve up to the budget.
 //!
 //! Source: Improved-GS, *Improving Densification in 3D Gaussian Splatting for High-Fidelity Rendering*,
@@ -16,9 +16,9 @@
 //! scores, until the curve is reached. To compute the scores, `views` random training views are rendered;
 //! in each, a Gaussian's score is the sum of the edges (the Laplacian of the photograph's luma, scaled to 0..1)
 //! over the pixels that it is blended into, divided by the mean of all positive sums of the view; the scores of
-//! all views are added. The first growth
-//! step after a recovery prune uses all views. After `final_from` the gradient itself is the score, no view
-//! is rendered, and `tau` is divided by `final_divisor`.
+//! all views are added. The first growth step after a recovery prune (see below) uses all views. After
+//! `final_from` the gradient itself is the score, no view is rendered, and `tau` is divided by
+//! `final_divisor`.
 //!
 //! A candidate is **split along its longest axis**. With d = `split_share`, two children are placed at
 //! ±3d standard deviations; their longest axis is 1 − d times the parent's, the others √(1 − d²)
@@ -54,7 +54,7 @@
 //!   all steps before it.
 //! - The published code divides edge scores by their mean over all Gaussians; here the mean is over the
 //!   Gaussians with a positive score in the view.
-//! - The last Gaussian is never pruned.
+//! - At least one Gaussian is always kept.
 //!
 //! ## Parameters
 //!

@@ -23,7 +23,7 @@ fn view(edges: &[f32]) -> View {
 }
 
 #[test]
-fn growth_follows_the_square_root() {
+fn growth_follows_the_square_root_curve() {
     // 140 · √(3500/14000) = 70 at step 4000.
     let event = event(4000, &[1.0; 60], 140);
     let done = run(&event, "");

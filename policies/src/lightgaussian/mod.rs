@@ -44,7 +44,7 @@
 //! - The published code divides V by a volume V_ref that 90 % of the Gaussians exceed. V_ref is the same for
 //!   all Gaussians and does not change their order, so it is left out.
 //! - ⌊share · N⌋ of N Gaussians are pruned; the published code also prunes all others with
-//!   the same significance as the last of these. The last Gaussian is never pruned.
+//!   the same significance as the last of these. At least one Gaussian is always kept.
 //! - Training views that nearly duplicate another are not rendered (`--full` renders all).
 //! - The published pipeline continues with distilled spherical harmonics and quantised vectors. They reduce
 //!   the file size of a finished model and are not part of density control.

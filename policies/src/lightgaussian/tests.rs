@@ -116,7 +116,7 @@ fn the_published_shares_leave_30_percent() {
     assert_eq!(rows_after(20_000, 1000, "schedule = \"once\""), 340);
     // ⌊0.5·7⌋ = 3.
     assert_eq!(rows_after(16_000, 7, ""), 4);
-    // The last row is kept.
+    // At least one row is kept.
     assert_eq!(rows_after(16_000, 7, "first_share = 1.0"), 1);
     assert_eq!(rows_after(16_000, 1, ""), 1);
 }

@@ -50,7 +50,7 @@
 //! - A Gaussian has one edit per event: a cloned Gaussian is not split as well.
 //! - A restarted Gaussian keeps its orientation, which has no effect as it is round.
 //! - Training views that nearly duplicate another are not rendered (`--full` renders all).
-//! - The last Gaussian is never pruned.
+//! - At least one Gaussian is always kept.
 //!
 //! ## Parameters
 //!

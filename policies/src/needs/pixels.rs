@@ -34,7 +34,7 @@ pub struct ErrorScore {
 /// photograph.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum ErrorMap {
-    /// The pixel's part of the training loss: 0.8 · |I − G| + 0.2 · (1 − SSIM).
+    /// The pixel's contribution to the training loss: 0.8 · |I − G| + 0.2 · (1 − SSIM).
     #[default]
     Loss,
     /// |I − G|, the error of the pixel's own colour.

@@ -65,8 +65,8 @@ pub struct Rate {
     pub end: f64,
 }
 
-/// A factor on learning rates that falls log-linearly from 1 to `to` in the last part of a run, so that
-/// the model does not memorise single photographs.
+/// A factor on learning rates that falls log-linearly from 1 to `to` between `from` and the end of a run, so
+/// that the model does not memorise single photographs.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Fade {
     /// Share of the run after which the fade begins, in `[0, 1)`.

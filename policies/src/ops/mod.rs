@@ -369,7 +369,7 @@ impl Slots {
         self.0.get(slot as usize / 64).is_some_and(|word| word >> (slot % 64) & 1 == 1)
     }
 
-    /// Adds `slot`, unless another entry has claimed it.
+    /// Adds `slot`; an error if another entry has claimed it.
     fn claim(&mut self, role: &str, slot: u32) -> Result<(), BrokenOps> {
         let is_new = !self.contains(slot);
         require(is_new, || format!("{role} {slot} is used by another entry"))?;

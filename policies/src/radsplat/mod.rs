@@ -34,7 +34,7 @@
 //!
 //! - The paper starts from a radiance field and trains on its renderings. Here the initial model and
 //!   the photographs are the same as for every other policy.
-//! - The last Gaussian is never pruned.
+//! - At least one Gaussian is always kept.
 //! - Training views that nearly duplicate another are not rendered (`--full` renders all).
 //! - The paper then groups cameras and stores which Gaussians each group sees. That speeds up viewing and
 //!   is not part of density control.

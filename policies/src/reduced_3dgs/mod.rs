@@ -51,7 +51,7 @@
 //! - The smallest pixel width is taken over the views since the last prune (a few epochs), not over all views. A
 //!   Gaussian that was visible in none of them has no sphere.
 //! - Redundancy is measured before the growth of the same step, and Gaussians that grow are not pruned.
-//! - The last Gaussian is never pruned.
+//! - At least one Gaussian is always kept.
 //!
 //! ## Parameters
 //!
@@ -76,7 +76,7 @@
 //! | prune_until | 30000 | >= 0 | step | end of pruning (inclusive) |
 //! | neighbours | 30 | 1 to 1000 | Gaussians | nearest neighbours that are tested |
 //! | sigmas | 3.0 | > 0 | standard deviations | half-axes of an ellipsoid |
-//! | deviations | 1.0 | >= 0 | standard deviations | a Gaussian is redundant only if R is this far above the mean |
+//! | deviations | 1.0 | >= 0 | standard deviations | a Gaussian is redundant only if R is this far above the mean R |
 //! | min_redundancy | 3.0 | >= 0 | Gaussians | a Gaussian is redundant only if R is above this |
 //! | faint_share | 0.03 | 0 to 1 | Gaussians | a Gaussian is faint only if it is below this quantile of opacity |
 //! | faint_opacity | 0.05 | 0 to 1 | | a Gaussian is faint only if it is below this opacity; 0: none is |

@@ -193,7 +193,7 @@ fn the_control_may_end_at_a_given_number() {
     assert_eq!(kept(27_000, 810, "prune_until = 27500"), 10);
     // Prunes after the run's last step do not count.
     assert_eq!(kept(29_000, 90, "prune_until = 90000"), 30);
-    // The first of the sixteen prunes after growth leaves 810·(1/81)^(1/16) = 615.5.
+    // The first of the sixteen prunes after growth leaves 810·(1/81)^(1/16) = 615.47.
     assert_eq!(kept(15_000, 810, ""), 615);
     let keep_one = "victims = \"random\"\nrandom_keep = 1";
     assert_eq!(run(&event(30_000, &xs[..30]), keep_one).ops.rows_after, 1);

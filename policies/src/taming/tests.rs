@@ -101,7 +101,7 @@ fn growth_is_bounded_by_the_curve_and_the_number_of_candidates() {
     assert_eq!((done.ops.rows_after, done.cloned.len()), (157, 57));
     assert!(!done.ops.reset_signals.is_empty());
     assert_eq!(done.ops.cause, "densify");
-    // 30 candidates.
+    // Only 30 rows are candidates.
     let gradient: Vec<f32> = (0..100).map(|row| if row < 30 { 8.01e-4 } else { 7.9e-4 }).collect();
     let few = event.clone().with(Signal::ScreenGradient, &gradient);
     assert_eq!(run(&few, "").ops.rows_after, 130);

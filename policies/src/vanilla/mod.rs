@@ -16,8 +16,8 @@
 //!    copy at the same place. Larger ones are split into two samples, with scales divided by
 //!    `split_factor`.
 //! 2. Gaussians less opaque than `min_opacity` are pruned; after step `max_scale_from` also those larger
-//!    than `max_scale` · scene extent. (Pruning by size on screen is dead code in the original.) The
-//!    last Gaussian is never pruned.
+//!    than `max_scale` · scene extent. (Pruning by size on screen is dead code in the original.) At
+//!    least one Gaussian is always kept.
 //! 3. The gradient statistics are reset.
 //!
 //! Every `reset_every` steps until `grow_until`, and on a white background once at `white_reset_at`,

@@ -127,6 +127,7 @@ fn the_governor_follows_the_curve_and_not_the_threshold() {
     // The last event, 144: 4 + 145·(1 − 1/145²) = 148.99.
     let last = run(&Event { step: 14_900, ..event.clone() }, "governor = true");
     assert_eq!(last.cloned, [2, 3, 1]);
+    // A model above the curve, here of 4 rows instead of 2.04, does not grow.
     let mut ahead = event;
     ahead.scene.initial_rows = 2;
     ahead.scene.budget = 5;
