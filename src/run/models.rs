@@ -84,8 +84,8 @@ pub fn names_of(paths: &[&Path]) -> Vec<String> {
             let mut others = whole.iter().filter(|other| *other != path);
             others.all(|other| last(other, *parts) != last(path, *parts))
         };
-        let most = path.components().count();
-        let parts = (1..most).find(is_unique).unwrap_or(most);
+        let count = path.components().count();
+        let parts = (1..count).find(is_unique).unwrap_or(count);
         files::one_line(&last(path, parts).to_string_lossy())
     };
     whole.iter().map(name).collect()

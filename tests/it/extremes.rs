@@ -34,9 +34,9 @@
 //! | 25 the optimiser | selftest; `tests/it/declared.rs: steps_use_the_gradients_accumulated_since_the_last_step`; `tests/it/agreement.rs: training_steps_match_the_native_backend` |
 //! | 26 poisoned rows | selftest; `tests/it/quarantine.rs: every_non_finite_value_is_found`; `src/train/trainer/tests/nonfinite.rs: nonfinite_rows_are_removed_before_the_policy_plans` |
 //! | 27 all faint, all prunable | selftest; `policies/src/adc.rs: one_row_is_spared`; `policies/src/conformance/tests.rs: every_registered_policy_conforms`; `policies/src/mcmc/tests.rs: nothing_happens_if_no_row_is_alive` |
-//! | 28 antialiasing, half precision | selftest; `src/render/cpu/narrow/tests.rs: f16_numbers_are_those_of_the_standard`; `src/render/cpu/narrow/tests.rs: rounding_is_fair_and_stays_between_the_neighbours`; `tests/it/quarantine.rs: every_non_finite_value_is_found` |
-//! | 29 whole numbers | `src/render/cpu/tiles.rs: bands_are_cut_without_overflow`; `src/render/cpu/budget.rs: huge_budgets_do_not_wrap_and_the_largest_is_refused`; `src/render/gpu/adapter.rs: the_best_adapter_that_matches_is_taken`; `src/train/checkpoint/tests.rs: headers_with_excessive_sizes_are_refused_without_allocation` |
-//! | 30 a long run | selftest, in full with `--long`; `src/train/trainer/edit.rs: slots_written_before_the_moves_count_for_the_peak`; `tests/it/edits/mod.rs: random_plans_match_the_plain_vector` |
+//! | 28 antialiasing, half precision | selftest; `src/render/cpu/narrow/tests.rs: f16_numbers_are_those_of_the_standard`; `src/render/cpu/narrow/tests.rs: f16_rounding_is_fair_and_stays_between_the_neighbours`; `tests/it/quarantine.rs: every_non_finite_value_is_found` |
+//! | 29 whole numbers | `src/render/cpu/tiles.rs: bands_are_cut_without_overflow`; `src/render/cpu/budget.rs: sizes_of_huge_budgets_do_not_overflow_and_the_largest_is_refused`; `src/render/gpu/adapter.rs: the_best_adapter_that_matches_is_taken`; `src/train/checkpoint/tests.rs: headers_with_excessive_sizes_are_refused_without_allocation` |
+//! | 30 a long run | selftest, in full with `--long`; `src/train/trainer/edit.rs: rows_written_before_the_moves_count_for_the_peak`; `tests/it/edits/mod.rs: random_plans_match_the_plain_vector` |
 
 use std::path::Path;
 

@@ -110,7 +110,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn text_is_read_up_to_its_limit_and_other_contents_are_refused() {
+    fn text_is_read_up_to_the_size_limit_and_other_contents_are_refused() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("text");
         let read = |bytes: &[u8]| {

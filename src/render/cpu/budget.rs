@@ -200,7 +200,7 @@ mod tests {
 
     /// Budgets around 2³¹ and 2³² rows, and one of 2⁴⁰, which needs more memory than the address space has.
     #[test]
-    fn huge_budgets_do_not_wrap_and_the_largest_is_refused() {
+    fn sizes_of_huge_budgets_do_not_overflow_and_the_largest_is_refused() {
         let model = Gaussians { sh_degree: 3, ..Gaussians::default() };
         for budget in [1 << 31, (1_usize << 32) - 1, 1 << 32, 1 << 40] {
             let options = Setup { threads: Some(1), ..Setup::new(budget) };

@@ -78,7 +78,7 @@ pub(super) fn surface_row(
 ) -> Option<usize> {
     let mut transmittance = 1.0_f32;
     let mut best = None;
-    let mut most = 0.0;
+    let mut max_weight = 0.0;
     for entry in list {
         let row = Entry::load(entry).row;
         let splat = &splats[row];
@@ -92,7 +92,7 @@ pub(super) fn surface_row(
         let weight = alpha * transmittance;
         transmittance -= weight;
         match mode {
-            DepthMode::MaxWeight if weight > most => (most, best) = (weight, Some(row)),
+            DepthMode::MaxWeight if weight > max_weight => (max_weight, best) = (weight, Some(row)),
             DepthMode::Median if transmittance < 0.5 => return Some(row),
             _ => {}
         }

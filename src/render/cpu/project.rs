@@ -248,8 +248,8 @@ pub(super) fn direction<S: Simd>(
     let v = each!(i in 3 => lanes(s, block, plane::MEAN + i, at) - view.centre[i]);
     let norm2 = dot(v, v);
     // Below this length the square underflows; the direction and its gradient are then 0.
-    let far = V::splat(s, 1e-30).lt(norm2);
-    let inv = far.keep(V::splat(s, 1.0) / norm2.sqrt());
+    let is_away = V::splat(s, 1e-30).lt(norm2);
+    let inv = is_away.keep(V::splat(s, 1.0) / norm2.sqrt());
     (each!(i in 3 => v[i] * inv), inv)
 }
 
@@ -293,10 +293,10 @@ fn log2_rho<S: Simd>(s: S, g: &Geometry<S>) -> V<S> {
     (g.sharp_det / g.det).min(V::splat(s, 1.0)).log2().min(V::zero(s)) * 0.5
 }
 
-/// Returns whether |x| <= most; false for NaN.
+/// Returns whether |x| <= max; false for NaN.
 #[inline(always)]
-fn below<S: Simd>(x: V<S>, most: f32) -> Mask<S> {
-    x.abs().le(V::splat_like(x, most))
+fn below<S: Simd>(x: V<S>, max: f32) -> Mask<S> {
+    x.abs().le(V::splat_like(x, max))
 }
 
 /// True if a splat reaches any pixel centre (½ to size − ½). False for NaN, so that rows with NaN are not

@@ -275,13 +275,13 @@ impl<S: Simd> RhoGradient<S> {
         let rows = [
             each!(i in 3 => {
                 let (j, k) = next(i);
-                let to = scale2[j] * r1[j] * h[k] - scale2[k] * r1[k] * h[j];
-                scale2[i] * (across * to - per_det * r0[i])
+                let cross = scale2[j] * r1[j] * h[k] - scale2[k] * r1[k] * h[j];
+                scale2[i] * (across * cross - per_det * r0[i])
             }),
             each!(i in 3 => {
                 let (j, k) = next(i);
-                let to = scale2[k] * r0[k] * h[j] - scale2[j] * r0[j] * h[k];
-                scale2[i] * (across * to - per_det * r1[i])
+                let cross = scale2[k] * r0[k] * h[j] - scale2[j] * r0[j] * h[k];
+                scale2[i] * (across * cross - per_det * r1[i])
             }),
         ];
         Self { log_scale, turn, rows }

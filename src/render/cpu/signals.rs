@@ -191,8 +191,8 @@ impl Accumulators {
                 if signal.kind() == SignalKind::Current {
                     return present(signal, row, params, masks, ages);
                 }
-                let parts = planes.clone().map(|plane| self.blocks.get(row, plane));
-                value_of(signal, parts.reduce(f32::max).unwrap_or(0.0))
+                let values = planes.clone().map(|plane| self.blocks.get(row, plane));
+                value_of(signal, values.reduce(f32::max).unwrap_or(0.0))
             };
             let of_row = |row: usize, numbers: &mut [f32]| match &attribute {
                 Some(attribute) => {

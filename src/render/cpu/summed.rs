@@ -1,7 +1,7 @@
 //! Gradients summed between optimiser steps, for policies that step less often than every
 //! iteration ([`Cadence`]). Other policies need no buffer and pay nothing.
 //!
-//! A step uses the sum of the gradients of all views since the last step. SH bands 1–3 may
+//! A step uses the sum of the gradients of all views since the previous step. SH bands 1–3 may
 //! step less often than all other parameters; they then need their own step counts per row
 //! (ages), because Adam's bias correction depends on the number of steps.
 

@@ -405,7 +405,7 @@ mod tests {
     }
 
     #[test]
-    fn chunks_cover_any_number_of_rows() {
+    fn chunks_of_any_number_of_rows_stay_within_the_limits() {
         for rows in [0, 1, 127, 128, 1 << 31, (1_usize << 32) - 1, 1 << 40] {
             for tiles in [0, 1, 8160, 1 << 20] {
                 let chunk = chunk_rows(rows, tiles);

@@ -25,8 +25,8 @@ impl GeometryMeasurement {
         let mut counted = training.clone();
         let [host, device] = self.bytes(rows, sh_degree);
         // Measuring reuses the device memory of training; only an excess is added.
-        let beyond = device.saturating_sub(training.on_device());
-        counted.add_to(Section::After, "measuring geometry", host + beyond);
+        let excess = device.saturating_sub(training.on_device());
+        counted.add_to(Section::After, "measuring geometry", host + excess);
         counted
     }
 

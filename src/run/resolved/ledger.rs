@@ -177,8 +177,8 @@ impl Case<'_> {
             pass("measuring a view", rendering + image + other);
         }
         let process = self.process_bytes();
-        if let Some(beyond) = self.inputs.peak.and_then(|peak| peak.checked_sub(process)) {
-            ledger.add_to(Section::Before, "loading the scene", beyond);
+        if let Some(excess) = self.inputs.peak.and_then(|peak| peak.checked_sub(process)) {
+            ledger.add_to(Section::Before, "loading the scene", excess);
         }
         ledger.add_to(Section::Process, "program and dataset", process);
         let stacks = threads as u64 * THREAD_BYTES;

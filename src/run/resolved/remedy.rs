@@ -12,7 +12,7 @@ use densify_render::BackendKind;
 const TINY_MEMORY: &str = "tiny-memory";
 
 impl Remedy {
-    /// Changes for new runs, cheapest first: the first cost time, the next view-dependent colours, the last detail.
+    /// For new runs, cheapest first: the first three cost time, the fourth view-dependent colours, the others detail.
     pub(super) const NEW_RUN: [Self; 7] = [
         Self::NoImages,
         Self::NoTileCap,

@@ -42,9 +42,9 @@ impl Size {
     /// Takes the size from the options.
     pub(super) fn as_given(case: &Case<'_>) -> Result<Self, Failure> {
         let rows = case.asked_budget().unwrap_or(DEFAULT_BUDGET);
-        let most = max_pairs(case, rows)?;
+        let max_pairs = max_pairs(case, rows)?;
         let per_row = case.choices.knobs.pairs_per_row.unwrap_or(PAIRS_PER_ROW);
-        let pairs = rows.saturating_mul(per_row).min(most);
+        let pairs = rows.saturating_mul(per_row).min(max_pairs);
         let mut run_size = RunSize {
             rows,
             sh_degree: case.choices.degree.highest(),

@@ -41,12 +41,12 @@ fn check(case: &Case<'_>, rows: usize) -> Result<(), TestCaseError> {
     };
     let (_, bytes) = sized_for(rows, None);
     for degree in 0..=case.choices.degree.highest() {
-        let held = size::rows_at(case, bytes, degree, rows).expect("it is solved");
-        prop_assert!(held >= Some(rows), "{rows} rows take {bytes}, which hold {held:?}");
+        let fitting = size::rows_at(case, bytes, degree, rows).expect("it is solved");
+        prop_assert!(fitting >= Some(rows), "{rows} rows take {bytes}, which hold {fitting:?}");
     }
     for memory in [bytes, bytes + bytes / 3] {
-        let most = size::rows_at(case, memory, 3, rows).expect("it is solved").expect("it fits");
-        for asked in [rows, most] {
+        let limit = size::rows_at(case, memory, 3, rows).expect("it is solved").expect("it fits");
+        for asked in [rows, limit] {
             let (rows, taken) = sized_for(asked, Some(ByteCount(memory)));
             prop_assert!(taken <= memory, "{rows} rows take {taken} of {memory}");
             prop_assert_eq!(rows, asked, "{} bytes", memory);

@@ -203,7 +203,7 @@ mod tests {
     }
 
     #[test]
-    fn choices_by_options_are_not_reported() {
+    fn reductions_by_options_are_not_reported() {
         let mut config = sample();
         let lines = |config: &RunConfig, unscored| {
             Requirements::new(config, 500, None, unscored).lines(Spelling::Terminal).join("\n")

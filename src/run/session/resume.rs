@@ -173,14 +173,14 @@ pub(super) fn check(
     output: &Path,
 ) -> Result<(), Failure> {
     let origin = resumed.origin(output);
-    let (ours, theirs) = (fixed(now)?, fixed(&resumed.config)?);
+    let (current, original) = (fixed(now)?, fixed(&resumed.config)?);
     let same_policy = now.spec.density.policy == resumed.config.spec.density.policy;
-    let keys: BTreeSet<&String> = ours.keys().chain(theirs.keys()).collect();
+    let keys: BTreeSet<&String> = current.keys().chain(original.keys()).collect();
     let differences: Vec<Difference> = keys
         .into_iter()
         .filter(|key| same_policy || !key.starts_with("policy_set."))
-        .filter(|key| ours.get(*key) != theirs.get(*key))
-        .map(|key| difference(key, ours.get(key), theirs.get(key)))
+        .filter(|key| current.get(*key) != original.get(*key))
+        .map(|key| difference(key, current.get(key), original.get(key)))
         .collect();
     if !differences.is_empty() {
         return Err(ResumeProblem::ResultWouldDiffer { origin, differences }.into());

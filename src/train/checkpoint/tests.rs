@@ -160,7 +160,7 @@ fn equal_states_give_equal_files() {
 }
 
 #[test]
-fn other_programs_read_the_arrays() {
+fn the_safetensors_library_reads_the_arrays() {
     let (_root, path) = written();
     let bytes = std::fs::read(&path).unwrap();
     let file = SafeTensors::deserialize(&bytes).unwrap();
@@ -248,15 +248,16 @@ fn arrays_of_another_run_are_refused_with_their_names() {
     };
     let plain = Setup { needs: Needs::default(), ..options(ROWS) };
     refused(plain, "has a tensor `signals.MeanGradientX`, which this run does not have");
-    let mut more = options(ROWS);
-    more.needs.signals = more.needs.signals.with(Signal::PixelCount);
-    refused(more, "there is no tensor `signals.PixelCount`");
-    let mut less = options(ROWS);
-    less.needs.cadence = Cadence { all: 1, sh_rest: 4 };
-    refused(less, "`summed.gradients`: its shape is [61, 23]; this run needs [61, 9]");
-    let mut fewer = options(ROWS);
-    fewer.needs.candidates = fewer.needs.candidates.map(|c| CandidateRequest { capacity: 3, ..c });
-    refused(fewer, "`candidates`: it has 4 candidates; this run holds at most 3");
+    let mut more_signals = options(ROWS);
+    more_signals.needs.signals = more_signals.needs.signals.with(Signal::PixelCount);
+    refused(more_signals, "there is no tensor `signals.PixelCount`");
+    let mut other_cadence = options(ROWS);
+    other_cadence.needs.cadence = Cadence { all: 1, sh_rest: 4 };
+    refused(other_cadence, "`summed.gradients`: its shape is [61, 23]; this run needs [61, 9]");
+    let mut fewer_candidates = options(ROWS);
+    fewer_candidates.needs.candidates =
+        fewer_candidates.needs.candidates.map(|c| CandidateRequest { capacity: 3, ..c });
+    refused(fewer_candidates, "`candidates`: it has 4 candidates; this run holds at most 3");
     let mut small = CpuBackend::new(&Gaussians::zeros(3, 1), &options(ROWS)).unwrap();
     let problem = Checkpoint::open(&path).unwrap().restore(&mut small).unwrap_err().to_string();
     assert!(problem.contains("`model.means`: it is F32 of shape [61, 3]"), "{problem}");

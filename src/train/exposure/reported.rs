@@ -38,20 +38,20 @@ pub fn complete_gains(gains: &mut [[f32; 3]], known: &[bool], stops: &[Option<f6
         let sum: f64 = gains[view].iter().map(|&gain| f64::from(gain).log2()).sum();
         STOPS * sum / 3.0
     };
-    let both = (0..known.len()).filter(|&view| known[view]);
-    let both: Vec<(f64, f64)> =
-        both.filter_map(|view| Some((by_tracks(view), stops[view]?))).collect();
+    let views = (0..known.len()).filter(|&view| known[view]);
+    let pairs: Vec<(f64, f64)> =
+        views.filter_map(|view| Some((by_tracks(view), stops[view]?))).collect();
     let offset = if known.contains(&true) {
-        let difference = spread(both.iter().map(|(tracks, exif)| exif - tracks));
+        let difference = spread(pairs.iter().map(|(tracks, exif)| exif - tracks));
         let [tracks, exif] =
-            [spread(both.iter().map(|pair| pair.0)), spread(both.iter().map(|pair| pair.1))];
-        if both.len() < MIN_COMPARED {
+            [spread(pairs.iter().map(|pair| pair.0)), spread(pairs.iter().map(|pair| pair.1))];
+        if pairs.len() < MIN_COMPARED {
             return ExifUse::Unused;
         }
         if difference > NEGLIGIBLE_DIFFERENCE.max(MAX_DIFFERENCE * tracks.max(exif)) {
             return ExifUse::Contradicted { by: difference };
         }
-        mean(both.iter().map(|(tracks, exif)| exif - tracks))
+        mean(pairs.iter().map(|(tracks, exif)| exif - tracks))
     } else {
         mean(stops.iter().copied().flatten())
     };

@@ -227,7 +227,7 @@ mod tests {
     }
 
     #[test]
-    fn one_pixel_has_a_closed_form() {
+    fn the_similarity_of_one_pixel_has_a_closed_form() {
         // The window sees the pixel with weight w and zeros elsewhere: μ = w·x, E[x²] = w·x².
         let w = window()[RADIUS].powi(2);
         let (x, y) = (f64::from(0.75_f32), 51.0 / 255.0);

@@ -178,7 +178,7 @@ impl RateOptions {
     /// A message with the name of the first invalid value and the values allowed; `None` if all values are valid.
     pub fn problem(&self) -> Option<String> {
         let end = |end: Option<f32>| f64::from(end.unwrap_or(1.0));
-        let starts = [
+        let may_be_0 = [
             ("mean_start", self.mean_start),
             ("log_scale", f64::from(self.log_scale)),
             ("quat", f64::from(self.quat)),
@@ -186,7 +186,7 @@ impl RateOptions {
             ("sh_dc", f64::from(self.sh_dc)),
             ("sh_rest", f64::from(self.sh_rest)),
         ];
-        let others = [
+        let above_0 = [
             ("mean_end", self.mean_end),
             ("boost", self.boost),
             ("fade", self.fade),
@@ -197,8 +197,8 @@ impl RateOptions {
             ("sh_dc_end", end(self.sh_dc_end)),
             ("sh_rest_end", end(self.sh_rest_end)),
         ];
-        let negative = starts.iter().find(|(_, rate)| !(rate.is_finite() && *rate >= 0.0));
-        let not_positive = others.iter().find(|(_, value)| !(value.is_finite() && *value > 0.0));
+        let negative = may_be_0.iter().find(|(_, rate)| !(rate.is_finite() && *rate >= 0.0));
+        let not_positive = above_0.iter().find(|(_, value)| !(value.is_finite() && *value > 0.0));
         negative
             .map(|(name, _)| format!("{name} must be a positive number, or 0 to freeze its values"))
             .or_else(|| not_positive.map(|(name, _)| format!("{name} must be a positive number")))

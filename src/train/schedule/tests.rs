@@ -66,7 +66,7 @@ fn steps_scale_with_the_run() {
 }
 
 #[test]
-fn degree_rises_every_thousand_steps_of_thirty_thousand() {
+fn the_degree_rises_every_1000_steps_in_a_run_of_30000() {
     let at = |step| sh_degree(step, 30_000, 3);
     assert_eq!([1, 999, 1_000, 1_999, 2_000, 3_000, 30_000].map(at), [0, 0, 1, 1, 2, 3, 3]);
     assert_eq!(sh_degree(300, 3_000, 3), 3);

@@ -105,7 +105,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn slots_written_before_the_moves_count_for_the_peak() {
+    fn rows_written_before_the_moves_count_for_the_peak() {
         let ops =
             RowOps { rows_before: 4, rows_after: 3, child_slots: vec![1, 5], ..RowOps::default() };
         assert_eq!(peak_rows(&ops), 6);

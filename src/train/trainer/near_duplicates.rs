@@ -26,7 +26,7 @@ pub(super) fn distinct_views(views: &impl ViewSource, extent: f32) -> Vec<usize>
     chosen
 }
 
-/// True if two cameras have nearly the same lens and orientation, and at most the distance `reach`.
+/// True if two cameras have nearly the same lens and orientation and are at most `reach` apart.
 fn are_near_duplicates(a: &Camera, b: &Camera, reach: f64) -> bool {
     let lengths = |camera: &Camera| [camera.fx, camera.fy, camera.cx, camera.cy];
     let apart = lengths(a).into_iter().zip(lengths(b)).map(|(a, b)| (a - b).abs());

@@ -21,8 +21,8 @@ pub(super) fn check_options(
         return bad(format!("{views} views, but the scene has {}", scene.train_views));
     }
     if options.iterations == 0 || options.iterations != scene.iterations {
-        let (here, there) = (options.iterations, scene.iterations);
-        return bad(format!("{here} iterations (scene: {there}); both must be equal and >= 1"));
+        let (given, of_scene) = (options.iterations, scene.iterations);
+        return bad(format!("{given} iterations (scene: {of_scene}); both must be equal and >= 1"));
     }
     if !(scene.extent.is_finite() && scene.extent > 0.0) {
         return bad(format!("the scene's extent is {}; it must be positive", scene.extent));
@@ -34,8 +34,8 @@ pub(super) fn check_options(
     let frozen = options.frozen;
     let expected = RowBudget::for_trainable(scene.budget, frozen).total;
     if budget != expected || rows > budget || rows < frozen {
-        let own = scene.budget;
-        return bad(format!("{rows} rows ({frozen} frozen), budget {budget} (scene's: {own})"));
+        let asked = scene.budget;
+        return bad(format!("{rows} rows ({frozen} frozen), budget {budget} (scene's: {asked})"));
     }
     Ok(())
 }

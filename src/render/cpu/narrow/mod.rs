@@ -137,8 +137,8 @@ impl Narrow for F8 {
         let drawn = (size.to_bits() + (random >> (32 - F8_DROPPED))) >> F8_DROPPED;
         let code = drawn.wrapping_sub(F8_BIAS).min(F8_MAX);
         let share = size * F8_INVERSE_LEAST;
-        let least = u32::from(share > unit(random, 23));
-        let code = if share < 1.0 { least } else { code };
+        let zero_or_one = u32::from(share > unit(random, 23));
+        let code = if share < 1.0 { zero_or_one } else { code };
         Self(if x.is_finite() { code } else { F8_NAN } as u8)
     }
 }
@@ -157,9 +157,9 @@ fn round_to_integer(x: f32, draw: f32) -> i32 {
     // Adding 1.5·2²³ leaves the nearest integer in the last bits.
     const SHIFT: f32 = 12_582_912.0;
     let shifted = x + SHIFT;
-    let beside = x - (shifted - SHIFT);
-    let away = if beside > 0.0 { 1 } else { -1 };
-    let away = if draw < beside.abs() { away } else { 0 };
+    let remainder = x - (shifted - SHIFT);
+    let away = if remainder > 0.0 { 1 } else { -1 };
+    let away = if draw < remainder.abs() { away } else { 0 };
     shifted.to_bits() as i32 + away
 }
 

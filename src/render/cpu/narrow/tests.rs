@@ -90,7 +90,7 @@ fn assert_fair<T: Narrow>(values: &[f32]) {
 }
 
 #[test]
-fn rounding_is_fair_and_stays_between_the_neighbours() {
+fn f16_rounding_is_fair_and_stays_between_the_neighbours() {
     let halves = (0..=F16_MAX as u16).map(|bits| F16(bits).to_f32());
     let mut values: Vec<f32> = halves.flat_map(|x| [x, -x]).collect();
     values.sort_by(f32::total_cmp);
@@ -105,7 +105,7 @@ fn rounding_is_fair_and_stays_between_the_neighbours() {
 
 /// Bytes: 7 bits of exponent and one of significand, without a sign.
 #[test]
-fn bytes_are_rounded_fairly_and_cover_the_range_that_adam_needs() {
+fn f8_rounding_is_fair_and_covers_the_range_that_adam_needs() {
     let values: Vec<f32> = (0..=F8_MAX as u8).map(|bits| F8(bits).to_f32()).collect();
     assert!(values.is_sorted() && values[0] == 0.0, "{values:?}");
     assert!(F8(F8_NAN as u8).to_f32().is_nan());
@@ -139,8 +139,8 @@ fn fixed_point_round_trips_and_rounds_fairly() {
             }
             let (found, share) = (f64::from(ups) / 16384.0, f64::from(x / step - low));
             assert!((found - share).abs() < 2e-4, "{x}: {found} instead of {share}");
-            let near = fixed::to_f32(fixed::nearest(x, digits), digits) - x;
-            assert!(near.abs() <= 0.5 * step, "{x}: the nearest is off by {near}");
+            let off = fixed::to_f32(fixed::nearest(x, digits), digits) - x;
+            assert!(off.abs() <= 0.5 * step, "{x}: the nearest is off by {off}");
         }
         for random in [0, u32::MAX] {
             for x in [most, 9e9, f32::MAX] {

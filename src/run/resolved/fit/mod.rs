@@ -69,8 +69,8 @@ pub(super) const IMAGE_SHARE_DIVISOR: u64 = 8;
 impl SizeRequest {
     /// A size with this many pairs per row, and at most 1 / [`IMAGE_SHARE_DIVISOR`] of the memory for images.
     pub(super) fn size(&self, rows: usize, sh_degree: u8, pairs: usize) -> RunSize {
-        let most = self.max_pairs.max(rows);
-        let tile_cap = self.tile_cap.unwrap_or_else(|| rows.saturating_mul(pairs).min(most));
+        let max_pairs = self.max_pairs.max(rows);
+        let tile_cap = self.tile_cap.unwrap_or_else(|| rows.saturating_mul(pairs).min(max_pairs));
         let share = self.memory / IMAGE_SHARE_DIVISOR;
         let images = || self.all_image_bytes.min(share).min(self.max_image_bytes);
         let image_cache = self.image_cache.unwrap_or_else(images);
@@ -90,23 +90,23 @@ pub(super) fn fit<E>(
     request: &SizeRequest,
     mut bytes: impl FnMut(&RunSize) -> Result<u64, E>,
 ) -> Result<Option<Fit>, E> {
-    let most = request.max_rows.max(1);
-    let least = request.min_rows.clamp(1, most);
-    let enough = request.enough_rows.clamp(least, most);
+    let max_rows = request.max_rows.max(1);
+    let min_rows = request.min_rows.clamp(1, max_rows);
+    let enough_rows = request.enough_rows.clamp(min_rows, max_rows);
     let mut at_wanted_degree = None;
     let mut largest = None;
     for degree in request.sh_degree.clone().rev() {
         let size = |rows| request.size(rows, degree, request.pairs[0]);
-        let rows = largest_where(least, most, |rows| Ok(bytes(&size(rows))? <= request.memory))?;
+        let rows = largest_where(min_rows, max_rows, |n| Ok(bytes(&size(n))? <= request.memory))?;
         at_wanted_degree.get_or_insert(rows.unwrap_or(0));
         largest = rows.map(|rows| (rows, degree));
-        if rows.is_some_and(|rows| rows >= enough) {
+        if rows.is_some_and(|rows| rows >= enough_rows) {
             break;
         }
     }
     let Some((rows, degree)) = largest else { return Ok(None) };
     let mut size = request.size(rows, degree, request.pairs[0]);
-    if rows == most {
+    if rows == max_rows {
         for pairs in request.pairs.into_iter().skip(1) {
             let larger = request.size(rows, degree, pairs);
             if bytes(&larger)? <= request.memory {
@@ -126,7 +126,7 @@ pub(super) fn fit<E>(
         }
     }
     let at_wanted_degree = at_wanted_degree.unwrap_or(rows);
-    Ok(Some(Fit { size, by_memory: rows < most, at_wanted_degree }))
+    Ok(Some(Fit { size, by_memory: rows < max_rows, at_wanted_degree }))
 }
 
 /// The smallest memory in which a model fits, in multiples of `step` bytes; `None` if none suffices.
@@ -148,20 +148,20 @@ pub(super) fn min_memory<E>(
     Ok(Some(insufficient.map_or(0, |steps| steps as u64 + 1) * step))
 }
 
-/// The largest number in `least..=most` for which `holds` returns true, which it must do up to some number and not
+/// The largest number in `min..=max` for which `holds` returns true, which it must do up to some number and not
 /// above it.
 pub(super) fn largest_where<E>(
-    least: usize,
-    most: usize,
+    min: usize,
+    max: usize,
     mut holds: impl FnMut(usize) -> Result<bool, E>,
 ) -> Result<Option<usize>, E> {
-    if least > most || !holds(least)? {
+    if min > max || !holds(min)? {
         return Ok(None);
     }
-    if holds(most)? {
-        return Ok(Some(most));
+    if holds(max)? {
+        return Ok(Some(max));
     }
-    let (mut good, mut bad) = (least, most);
+    let (mut good, mut bad) = (min, max);
     while bad - good > 1 {
         let middle = good + (bad - good) / 2;
         *(if holds(middle)? { &mut good } else { &mut bad }) = middle;

@@ -22,11 +22,11 @@ impl ImaginaryRun {
         let RunSize { rows, sh_degree, tile_cap, image_cache, .. } = *size;
         let coefficients = (u64::from(sh_degree) + 1).pow(2);
         let rows = rows.next_multiple_of(16) as u64;
-        let held = image_cache.max(2 * self.largest_image) + self.largest_image;
+        let image_bytes = image_cache.max(2 * self.largest_image) + self.largest_image;
         self.fixed
             + rows * (self.per_row + coefficients * self.per_coefficient)
             + tile_cap as u64 * self.per_pair
-            + held.min(self.all_image_bytes)
+            + image_bytes.min(self.all_image_bytes)
     }
 
     fn fit(&self, request: &SizeRequest) -> Option<Fit> {
@@ -81,16 +81,16 @@ fn requests() -> impl Strategy<Value = (ImaginaryRun, SizeRequest)> {
 
 /// Checks that the size fits, keeps the given values, and cannot be larger.
 fn check_fit(run: &ImaginaryRun, request: &SizeRequest) -> Result<(), TestCaseError> {
-    let SizeRequest { memory, max_rows: most, tile_cap, image_cache, pairs, .. } = *request;
+    let SizeRequest { memory, max_rows, tile_cap, image_cache, pairs, .. } = *request;
     let lowest = *request.sh_degree.start();
     let Some(Fit { size, by_memory, at_wanted_degree }) = run.fit(request) else {
-        let least = request.size(1_000.min(most), lowest, pairs[0]);
+        let least = request.size(1_000.min(max_rows), lowest, pairs[0]);
         prop_assert!(run.bytes(&least) > memory);
         return Ok(());
     };
     prop_assert!(run.bytes(&size) <= memory);
-    prop_assert!(size.rows <= most && size.rows <= size.tile_cap);
-    prop_assert_eq!(by_memory, size.rows < most);
+    prop_assert!(size.rows <= max_rows && size.rows <= size.tile_cap);
+    prop_assert_eq!(by_memory, size.rows < max_rows);
     // Given values are kept.
     prop_assert!(size.sh_degree >= lowest);
     prop_assert!(tile_cap.is_none_or(|cap| size.tile_cap == cap.max(size.rows)));
@@ -109,7 +109,7 @@ fn check_fit(run: &ImaginaryRun, request: &SizeRequest) -> Result<(), TestCaseEr
         );
     }
     // The degree is lowered only if too few rows fit at a higher one.
-    let enough = 20_000.min(most);
+    let enough = 20_000.min(max_rows);
     prop_assert!(size.sh_degree == 3 || at_wanted_degree < enough);
     if size.sh_degree < 3 {
         let higher = request.size(enough, size.sh_degree + 1, pairs[0]);
@@ -143,12 +143,12 @@ proptest! {
     fn min_memory_is_minimal(run in runs(), step in 1..2_000_000_u64) {
         let request = request(&run, 0);
         let bytes = |size: &RunSize| Ok::<_, Infallible>(run.bytes(size));
-        let least = min_memory(&request, step, bytes).unwrap_or_else(|never| match never {});
-        let least = least.expect("a number");
-        prop_assert!(least.is_multiple_of(step));
+        let minimum = min_memory(&request, step, bytes).unwrap_or_else(|never| match never {});
+        let minimum = minimum.expect("a number");
+        prop_assert!(minimum.is_multiple_of(step));
         let fits = |memory| run.fit(&SizeRequest { memory, ..request.clone() }).is_some();
-        prop_assert!(fits(least));
-        prop_assert!(least < step || !fits(least - step));
+        prop_assert!(fits(minimum));
+        prop_assert!(minimum < step || !fits(minimum - step));
     }
 }
 

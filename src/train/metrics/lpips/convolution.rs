@@ -68,16 +68,16 @@ impl Convolution {
     pub(super) fn run(&self, image: &Activation, rows: Range<usize>) -> Activation {
         let width = self.output_side(image.width);
         let pixels = rows.len() * width;
-        let blocks = pixels.div_ceil(PIXELS);
+        let chunks = pixels.div_ceil(PIXELS);
         let arch = Arch::new();
-        let block = |block: usize| {
-            let pixels = block * PIXELS..((block + 1) * PIXELS).min(pixels);
+        let chunk = |chunk: usize| {
+            let pixels = chunk * PIXELS..((chunk + 1) * PIXELS).min(pixels);
             let place = |pixel: usize| (rows.start + pixel / width, pixel % width);
             let inputs = self.gather(image, pixels.map(place));
             arch.dispatch(|| self.multiply(&inputs))
         };
-        let all = || (0..blocks).into_par_iter().map(block).collect::<Vec<_>>();
-        let by_block = match &*THREADS {
+        let all = || (0..chunks).into_par_iter().map(chunk).collect::<Vec<_>>();
+        let by_chunk = match &*THREADS {
             Some(pool) => pool.install(all),
             None => all(),
         };
@@ -85,8 +85,8 @@ impl Convolution {
         for (output, (channel, &bias)) in
             result.values.chunks_exact_mut(pixels.max(1)).zip(&self.bias).enumerate()
         {
-            for (pixels, block) in channel.chunks_mut(PIXELS).zip(&by_block) {
-                for (pixel, sum) in pixels.iter_mut().zip(&block[output]) {
+            for (pixels, chunk) in channel.chunks_mut(PIXELS).zip(&by_chunk) {
+                for (pixel, sum) in pixels.iter_mut().zip(&chunk[output]) {
                     let value = sum + bias;
                     // `max` would lose a NaN.
                     *pixel = if value < 0.0 { 0.0 } else { value };

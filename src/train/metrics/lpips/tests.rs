@@ -33,9 +33,9 @@ fn random(network: Network) -> Arrays {
     };
     for (stage, layers) in network.stages().into_iter().enumerate() {
         for &(number, [inputs, outputs], side, ..) in layers {
-            let most = (6.0 / (inputs * side * side) as f64).sqrt();
+            let limit = (6.0 / (inputs * side * side) as f64).sqrt();
             let name = format!("net.slice{}.{number}", stage + 1);
-            add(format!("{name}.weight"), vec![outputs, inputs, side, side], [-most, most]);
+            add(format!("{name}.weight"), vec![outputs, inputs, side, side], [-limit, limit]);
             add(format!("{name}.bias"), vec![outputs], [-0.1, 0.1]);
         }
         let channels = layers[layers.len() - 1].1[1];

@@ -45,7 +45,7 @@ fn a_plan_that_changes_nothing_is_not_an_event() {
 }
 
 #[test]
-fn the_peak_is_kept_after_pruning() {
+fn the_peak_number_of_rows_is_kept_after_pruning() {
     let (mut trainer, ..) = trainer(&Case { rows: 8, behaviour: Behaviour::Halve, ..CASE });
     for _ in 0..4 {
         trainer.step().unwrap();

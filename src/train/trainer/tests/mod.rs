@@ -29,7 +29,7 @@ mod nonfinite;
 mod policy_views;
 mod steps;
 
-/// All calls to a fake object, in order.
+/// All calls to the backend, or to the source of views, of a test, in order.
 type CallLog = Arc<Mutex<Vec<String>>>;
 
 fn note(log: &CallLog, call: String) {
@@ -40,6 +40,7 @@ struct CountingBackend {
     rows: usize,
     budget: usize,
     nan_loss_at: u32,
+    /// Number of rows with non-finite values, until an edit removes them.
     unsound: u32,
     log: CallLog,
     ledger: Ledger,

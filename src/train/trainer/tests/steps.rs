@@ -23,7 +23,7 @@ fn every_epoch_shows_every_view_once_and_prefetches() {
     }
 }
 
-/// Each view has its own exposure, which is changed by steps with this view and is saved in checkpoints.
+/// Each view has its own exposure, which is learned in the steps of this view and is saved in checkpoints.
 #[test]
 fn exposures_belong_to_views() {
     let gains = [[1.0, 0.5, 1.0], [1.0; 3], [1.0, 1.5, 1.0]];

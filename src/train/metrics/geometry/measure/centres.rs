@@ -63,7 +63,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn percentiles_count_by_weight() {
+    fn percentiles_are_weighted() {
         let values = vec![(3.0, 1.0), (1.0, 8.0), (2.0, 1.0)];
         assert_eq!(percentile(values.clone(), 0.5), 1.0);
         assert_eq!(percentile(values.clone(), 0.9), 2.0);
