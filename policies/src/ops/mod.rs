@@ -283,7 +283,7 @@ impl RowOps {
             let bad_field = self.find_offspring(family).map_or(Some("shape"), |o| o.bad_field());
             validate(bad_field, || format!("family of row {parent}"))?;
             require(family.first_child as usize == first_child, || {
-                format!("family of row {parent} starts at {}", family.first_child)
+                format!("family of row {parent} starts at child {}", family.first_child)
             })?;
             first_child += family.children as usize;
             self.check_live("parent", parent)?;

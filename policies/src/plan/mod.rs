@@ -62,7 +62,7 @@ pub fn bytes_per_row(needs: &Needs) -> usize {
 
 /// The edits of one event.
 ///
-/// Rows are identified by their index before the edit. `rows − pruned + added <= budget` holds at every
+/// Rows are identified by their index before the edit. `rows − pruned + added <= budget` holds after every
 /// call, so at the budget a policy prunes first, then grows. (A plan that starts above its budget has
 /// no [`room`](Self::room) and can only shrink.)
 #[derive(Debug)]

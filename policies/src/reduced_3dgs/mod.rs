@@ -26,7 +26,7 @@
 //! 2. Faint Gaussians, those below both `faint_opacity` and the `faint_share` quantile of all opacities, are pruned.
 //! 3. After growth (`grow_until`), Gaussians below opacity 1/255 are pruned, as they are never rendered.
 //!
-//! **Loss.** `opacity_term` · mean opacity is added, so that unneeded Gaussians fade.
+//! **Loss.** `opacity_term` · mean opacity is added to the loss, so that unneeded Gaussians fade.
 //!
 //! `victims = "random"` is a control that measures the effect of the criterion: it prunes the same number at
 //! random. As it leaves redundant Gaussians, it then finds more to prune than the real run. To end at the same

@@ -1,7 +1,7 @@
 //! # taming — growth along a curve, by a score measured in rendered views
 //!
 //! Densifies Gaussians with large screen gradients, drawn by a score that measures their importance in badly
-//! rendered views. Their number follows a concave curve up to the budget.
+//! rendered views. The number of Gaussians follows a concave curve up to the budget.
 //!
 //! Source: *Taming 3DGS: High-Quality Radiance Fields with Limited Resources*, Mallick, Goel, Kerbl,
 //! Vicente Carrasco, Steinberger, De la Torre, SIGGRAPH Asia 2024, arXiv 2406.15643, with the constants
@@ -15,9 +15,10 @@
 //!    s = Σ over views v of 50·L_v·[z(25, g_p) + z(100, opacity) + z(5, depth) + z(10, radius) +
 //!    z(25, s_x·s_y·s_z) + z(50, Σ distance) + z(10, Σ M_v) + z(0.1, pixels) + z(50, Σ α·T)],
 //!    over the views that show the Gaussian. L_v is the view's loss, g_p the screen gradient,
-//!    z(c, x) = c·x / median of the positive x (0 for x <= 0), sums run over the pixels that the
-//!    Gaussian is blended into, and M_v = 50·n(|I − G|) + 50·n(edge) is a pixel map, where n scales to
-//!    0..1. The coefficients are parameters (`…_weight`).
+//!    z(c, x) = c·x / median of the positive x (0 for x <= 0), and the inner sums run over the pixels that the
+//!    Gaussian is blended into, with distances from the projected mean. M_v = 50·n(|I − G|) + 50·n(edge) is a
+//!    pixel map, where edge is the Laplacian of the photograph's luma, and n scales to 0..1. The coefficients
+//!    are parameters (`…_weight`).
 //! 2. Gaussians with g_p of at least `tau` are candidates; as in `vanilla`, small ones are cloned and
 //!    large ones split. The model grows by at most the number of candidates and at most up to the curve
 //!    N(x) = S + (B − S)(2x/M − (x/M)²) after x of M intervals, from the S initial Gaussians to the budget B.
@@ -28,7 +29,7 @@
 //! 4. The gradient statistics are reset.
 //!
 //! Opacities are reset as in `vanilla`. SH bands 1–3 have the learning rate `sh_rest` and step once per
-//! `sh_every` iterations, on the summed gradients (`--lr` overrides these).
+//! `sh_every` iterations, on the summed gradients (`--lr` overrides the rate).
 //!
 //! With `multiplier` m > 0 the curve ends at ⌊m · S⌋ instead, but never above the budget.
 //!
