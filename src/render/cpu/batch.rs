@@ -1,5 +1,5 @@
 //! Batches of splats from a tile's list. A tile is divided into patches of 4×4 pixels. The coordinates (u, z) of a
-//! pixel (see [`project`](super::project)) are stored per splat as two summands: one per patch, one per pixel of a patch.
+//! pixel (see [`project`](super::project)) are stored per splat as two summands: one per patch, one per pixel in it.
 //!
 //! A batch is filled before any of its patches is rendered. Which splats reach a patch is then known before the loop
 //! over these splats starts, so that the loop's exit depends on a finished bit mask, not on arithmetic in flight.

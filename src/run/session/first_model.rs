@@ -157,8 +157,8 @@ fn in_view(model: &Gaussians, dataset: &Dataset) -> usize {
     model.means.par_iter().filter(|mean| shows(mean)).count()
 }
 
-/// Fails if the model of `--init` is in other coordinates than the dataset. If there are frozen Gaussians, the model may
-/// be a small part of the scene, so the user is only told.
+/// Fails if the model of `--init` is in other coordinates than the dataset. If there are frozen Gaussians, the model
+/// may be a small part of the scene, so the user is only told.
 ///
 /// # Errors
 /// When the model is in other coordinates, or a view cannot be read or rendered.

@@ -66,8 +66,8 @@ impl RunSpec {
         scene.ok_or_else(|| OptionProblem::NoScene.into())
     }
 
-    /// The folder to write to. The default is `output/SCENE-POLICY`, where SCENE is the name of the dataset's folder, or
-    /// of its archive without the ending.
+    /// The folder to write to. The default is `output/SCENE-POLICY`, where SCENE is the name of the dataset's folder,
+    /// or of its archive without the ending.
     ///
     /// # Errors
     /// When neither scene nor folder is given.
@@ -95,8 +95,8 @@ impl RunSpec {
     }
 
     /// The learning rates: the defaults for a run of this length, overlaid with `policy_rates`. The rates of positions
-    /// are then multiplied by `position_factor`. If the run starts from a model, the rates are [fine](RateOptions::fine),
-    /// except with `--init-rates full`. `--lr` is overlaid last.
+    /// are then multiplied by `position_factor`. If the run starts from a model, the rates are
+    /// [fine](RateOptions::fine), except with `--init-rates full`. `--lr` is overlaid last.
     ///
     /// # Errors
     /// When a name in `--lr` is not a rate, or its value is not allowed.

@@ -154,8 +154,8 @@ fn a_resumed_run_has_no_incomplete_files() {
 fn an_interrupted_replacement_is_completed_or_undone_by_the_next_run() {
     const OLD_RUN: [&str; 2] = ["cameras.json", "config.toml"];
     const NEW_RUN: [&str; 2] = ["config.toml", "results.json"];
-    // Numbers of files of the old and of the new run that had been moved before the interruption; `None` for the new run
-    // if the old run was still being moved.
+    // Numbers of files of the old and of the new run that had been moved before the interruption; `None` for the new
+    // run if the old run was still being moved.
     for (out, moved_in) in
         [(0, None), (1, None), (2, None), (2, Some(0)), (2, Some(1)), (2, Some(2))]
     {
