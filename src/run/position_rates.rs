@@ -10,8 +10,8 @@ use densify_data::dataset::normalise::EXTENT;
 use crate::spec::RunSpec;
 
 /// The rates are reduced if the median depth of what the views show is below this `[fraction of the extent]`. The
-/// median depth is 0.5 to 2 in scenes around an object or in a room. It is 0.04 in a corridor of 120 m, where a third of the
-/// default rates is best.
+/// median depth is 0.5 to 2 in scenes around an object or in a room. It is 0.04 in a corridor of 120 m, where a third
+/// of the default rates is best.
 const USUAL_DEPTH: f64 = 0.12;
 
 /// The reduction of the default learning rates of positions.

@@ -14,7 +14,7 @@ pub static KNOBS: &[Knob] = &[
         unit: "pairs",
         only_on: Some(Cpu),
         class: Exact,
-        effect: "(Gaussian, tile) pairs per Gaussian, 2 in 5 with gradients; auto: 16 (4 to 16 with --memory), all with gradients",
+        effect: "tile pairs per Gaussian, 2 in 5 with gradients; auto: 16 (4 to 16 with --memory), all with gradients",
         levels: &["4", "2", "1"],
         set: |knobs, value| knobs.pairs_per_row = value.parse().ok(),
     },
