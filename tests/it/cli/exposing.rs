@@ -204,5 +204,5 @@ fn auto_detects_differing_exposures_before_training() {
         }
     }
     call(&format!("{words} -o {} --exposure-jitter 9", text(&root.path().join("none"))))
-        .refused("too much", &["--exposure-jitter", "9 stops", "0 to 8"]);
+        .refused("too much", &["--exposure-jitter", "9 is not between 0 and 8 stops"]);
 }

@@ -190,7 +190,7 @@ fn invalid_input_is_refused_and_writes_nothing() {
         ("--preset thin --size 99999", &["--size", "99999"]),
         ("--preset thin --fov 180", &["--fov"]),
         ("--preset thin --rig file", &["--rig"]),
-        ("--preset thin --train 0", &["--train", "0 views"]),
+        ("--preset thin --train 0", &["--train", "0 is not between"]),
         ("--preset thin --lens fish", &["--lens", "fisheye:K1"]),
         ("--preset thin --lens radial:-0.9", &["--lens", "degrees", "--fov"]),
         ("--preset thin --passers-by 1.5", &["--passers-by", "1.5"]),
