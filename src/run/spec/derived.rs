@@ -4,7 +4,7 @@
 use std::path::{Path, PathBuf};
 
 use densify_policies::policy::RateOverrides;
-use densify_policies::registry::{PolicyEntry, find};
+use densify_policies::registry::{PolicyEntry, find, import};
 use toml::{Table, Value};
 
 use super::knobs::Knobs;
@@ -131,11 +131,22 @@ impl RunSpec {
         rates.problem().map_or(Ok(rates), |problem| Err(fail(&problem)))
     }
 
+    /// Imports the policies of `--policy-file`.
+    ///
+    /// # Errors
+    /// When this program cannot run Python, or an import fails.
+    pub(crate) fn import_policies(&self) -> Result<(), Failure> {
+        self.density.policy_file.iter().try_for_each(|file| {
+            import(&file.0).map_err(|error| OptionProblem::value("policy_file", error).into())
+        })
+    }
+
     /// The policy, and the parameters that are set for it.
     ///
     /// # Errors
     /// When there is no such policy, or a parameter is set twice.
     pub fn policy(&self) -> Result<(&'static PolicyEntry, Table), Failure> {
+        self.import_policies()?;
         let entry = find(&self.density.policy)?;
         let mut tables = values::table(&self.density.policy_set)
             .map_err(|problem| OptionProblem::Conflict { option: "policy_set", problem })?;
