@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use densify_compress as compressing;
+use densify_core::numbers;
 use densify_data::dataset::builtin;
 use densify_data::models::{compress_formats, find, find_by_extension};
 use densify_report::ReportOptions;
@@ -281,4 +282,18 @@ pub(crate) fn report(
         };
         densify_report::write(&options, &output, follower)
     })
+}
+
+/// A size to reach: a number of Gaussians, or the bytes of a file.
+#[pyfunction]
+pub(crate) fn parse_target(text: &str) -> PyResult<(Option<usize>, Option<u64>)> {
+    let wrong = |error: String| {
+        PyValueError::new_err(format!(
+            "to: {error}; give a size such as \"5MiB\", or a number of Gaussians such as \"20k\""
+        ))
+    };
+    if text.trim_end().ends_with(['b', 'B']) {
+        return Ok((None, Some(numbers::bytes(text).map_err(wrong)?)));
+    }
+    Ok((Some(numbers::rows(text).map_err(wrong)?), None))
 }
