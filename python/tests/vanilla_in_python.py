@@ -84,15 +84,10 @@ class Vanilla:
         count = max(self._allowed(now) - now.rows, 0) if self.governor else len(parents)
         # In the order of their gradients, clones and splits mixed, as the budget may end anywhere.
         order = densify.largest(parents, gradient, count)
-        start = 0
-        while start < len(order):
-            kind = is_small[order[start]]
-            length = next(
-                (at for at, row in enumerate(order[start:]) if is_small[row] != kind), len(order) - start
-            )
-            children = densify.clone() if kind else densify.split(self.split_factor)
-            plan.grow(order[start : start + length], children)
-            start += length
+        kinds = is_small[order]
+        for part in np.split(order, np.flatnonzero(np.diff(kinds)) + 1):
+            if len(part) > 0:
+                plan.grow(part, densify.clone() if is_small[part[0]] else densify.split(self.split_factor))
         dead = np.flatnonzero(dies(scale) & plan.free)
         plan.prune(densify.spare_one(dead, opacity))
 

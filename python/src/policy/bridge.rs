@@ -20,6 +20,8 @@ use super::{failed, needs};
 const MODULE: &str = "densify._policy";
 /// Steps that are asked for at once: each call from a loop without the interpreter may wait for other threads.
 const AHEAD: u32 = 1000;
+/// The same for a policy with state, which is asked again after every event.
+const AHEAD_WITH_STATE: u32 = 100;
 
 /// Answers for consecutive steps.
 struct Answers<T> {
@@ -133,7 +135,8 @@ impl PythonPolicy {
         }
         let mut values = Vec::new();
         Python::attach(|py| {
-            for next in step..step.saturating_add(AHEAD) {
+            let ahead = if self.state.is_some() { AHEAD_WITH_STATE } else { AHEAD };
+            for next in step..step.saturating_add(ahead) {
                 match ask(self.object.bind(py), next) {
                     Ok(value) => values.push(value),
                     Err(error) if next == step => {
@@ -160,8 +163,10 @@ impl PythonPolicy {
             called.map_err(|error| failed(py, error))
         });
         self.state = done?;
-        // Schedules may depend on the state.
-        self.schedules = Schedules::default();
+        if self.state.is_some() {
+            // Schedules may depend on the state, and on nothing else that changes.
+            self.schedules = Schedules::default();
+        }
         Ok(())
     }
 }
