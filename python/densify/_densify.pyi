@@ -8,13 +8,54 @@ from numpy.typing import ArrayLike, NDArray
 from ._edits import Offspring, Opacity, Rule
 from ._names import Column, Signal
 
-CameraParts: TypeAlias = tuple[int, int, list[float], list[list[float]]]
+_CameraParts: TypeAlias = tuple[int, int, list[float], list[list[float]]]
 _Floats: TypeAlias = NDArray[np.float32]
 _Mask: TypeAlias = NDArray[np.bool_]
 _Rows: TypeAlias = NDArray[np.uint32]
 _View: TypeAlias = tuple[_Floats, _Floats, _Floats]
 
 __version__: str
+__all__ = [
+    "Stop",
+    "ModelArrays",
+    "OpenedModel",
+    "open_model",
+    "PageCore",
+    "serve",
+    "Now",
+    "Plan",
+    "Points",
+    "Rng",
+    "Scene",
+    "View",
+    "check_policy",
+    "columns",
+    "largest",
+    "mean_over_views",
+    "policies",
+    "quantile",
+    "register",
+    "signals",
+    "smallest",
+    "spare_one",
+    "top_k",
+    "compare",
+    "compress",
+    "parse_target",
+    "plan",
+    "report",
+    "scenegen",
+    "TrainerCore",
+    "prepare",
+    "train",
+    "builtin_scenes",
+    "initialise",
+    "main",
+    "option_names",
+    "run_config",
+    "write_image",
+    "__version__",
+]
 
 @final
 class Stop:
@@ -146,7 +187,7 @@ class ModelArrays:
         overwrite: bool = False,
         listener: Any = None,
     ) -> None: ...
-    def render(self, cameras: Sequence[CameraParts], background: Sequence[float], device: str) -> list[_View]: ...
+    def render(self, cameras: Sequence[_CameraParts], background: Sequence[float], device: str) -> list[_View]: ...
     def __len__(self) -> int: ...
     @property
     def means(self) -> _Floats: ...
@@ -170,7 +211,7 @@ class TrainerCore:
     def step(self) -> tuple[int, int, str, float, float, float, int, str]: ...
     def finish(self, *, overwrite: bool, listener: Any, stop: Stop) -> str: ...
     def model(self) -> ModelArrays: ...
-    def render(self, view: CameraParts, background: Sequence[float]) -> _View: ...
+    def render(self, view: _CameraParts, background: Sequence[float]) -> _View: ...
     @property
     def steps_done(self) -> int: ...
     @property
@@ -185,7 +226,7 @@ class TrainerCore:
 
 @final
 class OpenedModel:
-    def views(self, split: str) -> list[tuple[str, CameraParts]]: ...
+    def views(self, split: str) -> list[tuple[str, _CameraParts]]: ...
     def render(self, split: str, view: int) -> tuple[_View, NDArray[np.uint8]]: ...
     def evaluate(
         self, split: str, *, lpips: str | None, fit_exposure: bool, listener: Any, stop: Stop

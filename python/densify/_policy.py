@@ -62,12 +62,12 @@ class _Registered:
 
 def interval(default: int) -> int:
     """A parameter: steps between two events. It scales with the length of the run, but not below 100."""
-    return cast(int, dataclasses.field(default=default, metadata={_SCALES: "interval"}))
+    return dataclasses.field(default=default, metadata={_SCALES: "interval"})
 
 
 def step(default: int) -> int:
     """A parameter: a step of the run, or a number of steps. It scales with the length of the run."""
-    return cast(int, dataclasses.field(default=default, metadata={_SCALES: "step"}))
+    return dataclasses.field(default=default, metadata={_SCALES: "step"})
 
 
 def state(default: T, *, init: Literal[False] = False) -> T:
@@ -184,7 +184,7 @@ def _protect(cls: type[Any], name: str, states: frozenset[str]) -> None:
 
     init.__wrapped__ = original  # type: ignore[attr-defined]
     cls.__init__ = init
-    cls.__setattr__ = set_attribute
+    cls.__setattr__ = set_attribute  # type: ignore[assignment]
     cls._states = states
 
 

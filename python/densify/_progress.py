@@ -87,7 +87,7 @@ def _notebook_line(handle: Any, text: str) -> Any:
     shell = ipython.get_ipython() if ipython is not None else None
     if shell is None or type(shell).__name__ != "ZMQInteractiveShell":
         return None
-    from IPython.display import display
+    from IPython.display import display  # type: ignore[import-not-found, unused-ignore]
 
     content = {"text/plain": text}
     if handle is None:

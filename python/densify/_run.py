@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from os import fspath
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,11 +28,11 @@ if TYPE_CHECKING:
     from ._options import Options
 
 Split = Literal["train", "test"]
-Scene = StrPath | Dataset
+Scene: TypeAlias = StrPath | Dataset
 #: A policy by name, or a class or an instance made with @densify.policy.
-PolicyLike = str | object
+PolicyLike: TypeAlias = str | object
 #: A run, its folder, or a model file.
-RunOrModel = "Run | StrPath"
+RunOrModel: TypeAlias = "Run | StrPath"
 
 
 def _table(
@@ -230,8 +230,8 @@ class Trainer:
 
     def step(self) -> Step:
         """Does one iteration."""
-        *numbers, events = self._core.step()
-        return Step(*numbers, events=json.loads(events))  # type: ignore[call-arg]
+        step, view, name, loss, l1, ssim, rows, events = self._core.step()
+        return Step(step, view, name, loss, l1, ssim, rows, json.loads(events))
 
     def __iter__(self) -> Iterator[Step]:
         with noting(self._stop):
@@ -588,7 +588,7 @@ def compare(
     iterations: int = 7000,
     output: StrPath = "comparison",
     progress: bool = True,
-    **options: Unpack[Options],
+    **options: Any,
 ) -> Comparison:
     """Trains a scene with several policies under the same conditions, and says which did best.
 
@@ -613,8 +613,8 @@ def compare(
         names.append(":".join([name, *words]))
     if files:
         table["policy_file"] = files
-    if isinstance(scenes, (str, Dataset)) or hasattr(scenes, "__fspath__"):
-        scenes = [scenes]  # type: ignore[list-item]
+    single = isinstance(scenes, str) or hasattr(scenes, "__fspath__")
+    all_scenes = cast("Sequence[Scene]", [scenes] if single else scenes)
     budgets: list[tuple[str | None, int]]
     if isinstance(budget, Mapping):
         budgets = list(budget.items())
@@ -623,7 +623,7 @@ def compare(
     stop = _densify.Stop()
     with noting(stop):
         summary, report = _densify.compare(
-            [fspath(scene) for scene in scenes],  # type: ignore[union-attr, arg-type]
+            [fspath(scene) for scene in all_scenes],
             names,
             budgets,
             plain(table),

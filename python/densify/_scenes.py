@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from os import PathLike, fspath
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,8 +21,8 @@ from ._errors import InputError
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-StrPath = str | PathLike[str]
-#: Views without points need two cameras at least.
+StrPath: TypeAlias = str | PathLike[str]
+#: Between OpenCV's axes and OpenGL's.
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
@@ -51,15 +51,15 @@ class Camera:
     @property
     def world_from_camera(self) -> NDArray[np.float64]:
         """The inverse of ``camera_from_world``."""
-        return np.linalg.inv(_matrix(self.camera_from_world))
+        return np.asarray(np.linalg.inv(_matrix(self.camera_from_world)), dtype=np.float64)
 
-    def _parts(self) -> _densify.CameraParts:
+    def _parts(self) -> _densify._CameraParts:
         matrix = [[float(value) for value in row] for row in _matrix(self.camera_from_world)]
         lens = [float(value) for value in (self.fx, self.fy, self.cx, self.cy)]
         return int(self.width), int(self.height), lens, matrix
 
     @staticmethod
-    def _of(parts: _densify.CameraParts) -> Camera:
+    def _of(parts: _densify._CameraParts) -> Camera:
         width, height, (fx, fy, cx, cy), rows = parts
         return Camera(width, height, fx, fy, cx, cy, np.array(rows))
 
