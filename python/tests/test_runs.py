@@ -56,7 +56,7 @@ def test_options_are_checked_by_the_same_code(scene: Path, tmp_path: Path) -> No
         ({"knob": {"alpha": 1}}, "alpha"),
         ({"lr": {"quat": -1}}, "quat"),
         ({"test_iterations": [70]}, "70"),
-        ({"policy_set": {"diet": {"rho": 7}}}, "rho"),
+        ({"policy_set": {"diet": {"rho": -1}}}, "rho"),
         ({"scene": tmp_path / "missing"}, "missing"),
     ]:
         with pytest.raises(densify.InputError, match=message) as raised:
