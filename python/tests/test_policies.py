@@ -407,6 +407,21 @@ def test_a_run_is_the_same_in_another_process(scene: Path, tmp_path: Path) -> No
         assert done.returncode == 2 and message in done.stderr, done.stderr
 
 
+def test_the_plug_in_of_pytest_runs_the_conformance_suite(tmp_path: Path) -> None:
+    def run(*words: str) -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, "-m", "pytest", "-q", str(tmp_path), *words]
+        return subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
+
+    done = run("--densify", str(EXAMPLES / "steady.py"))
+    assert done.returncode == 0 and "1 passed" in done.stdout, done.stdout + done.stderr
+    broken = tmp_path / "broken.py"
+    text = (EXAMPLES / "steady.py").read_text().replace('"steady"', '"broken"')
+    broken.write_text(text.replace("plan.prune(densify.spare_one(faint, now[\"opacity\"]))", "plan.prune(range(now.rows))"))
+    done = run("--densify", str(broken))
+    assert done.returncode == 1 and "leaves at least one row" in done.stdout, done.stdout + done.stderr
+    assert run("--densify", "missing.py").returncode == 4
+
+
 def test_a_file_that_starts_a_run_when_it_is_imported_is_refused(tmp_path: Path) -> None:
     file = tmp_path / "runs.py"
     file.write_text("import densify\ndensify.train('scene:spheres')\n")
