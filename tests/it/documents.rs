@@ -5,9 +5,9 @@ use std::collections::BTreeSet;
 use std::path::Path;
 
 /// Folders of the project. Files in the root belong to it too; other folders in the root do not.
-const FOLDERS: [&str; 10] = [
-    ".cargo", ".ci", ".github", "benches", "docs", "policies", "scenegen", "shaders", "src",
-    "tests",
+const FOLDERS: [&str; 11] = [
+    ".cargo", ".ci", ".github", "benches", "docs", "policies", "python", "scenegen", "shaders",
+    "src", "tests",
 ];
 /// Generated from the options of a run, so neither counted nor searched.
 const GENERATED: &str = "docs/options.md";
