@@ -186,7 +186,8 @@ pub fn run_with(arguments: impl IntoIterator<Item = impl Into<OsString> + Clone>
 }
 
 /// The parser, with the defaults of a run's options filled in for every command that takes such options.
-fn command() -> clap::Command {
+#[must_use]
+pub fn command() -> clap::Command {
     const WITH_RUN_OPTIONS: [&str; 9] =
         ["train", "plan", "compress", "eval", "export", "render", "report", "selftest", "view"];
     WITH_RUN_OPTIONS.iter().fold(Arguments::command(), |command, name| {
