@@ -254,7 +254,7 @@ def register(
     class_: type[Any],
     about: tuple[str, str, str, str],
     place: tuple[str, int],
-    identity: str,
+    origin: tuple[str, str],
     parameters: Sequence[tuple[str, Any, str, str]],
 ) -> None: ...
 def top_k(values: ArrayLike, k: int) -> _Rows: ...

@@ -9,6 +9,7 @@ import importlib.util
 import inspect
 import json
 import math
+import platform
 import sys
 import warnings
 from collections.abc import Callable
@@ -131,8 +132,18 @@ def _describe(cls: type[Any], name: str, summary: str, source: str, manual: str)
     # A file may be imported under several names; a cell of a notebook has a new file each time.
     identity = f"{file or cls.__module__}:{cls.__qualname__}"
     shown = file or f"<{cls.__module__}>"
-    _densify.register(cls, (name, summary, source, manual), (shown, line), identity, parameters)
+    about = (name, summary, source, manual)
+    _densify.register(cls, about, (shown, line), (identity, _provenance(file)), parameters)
     setattr(cls, MARK, _Registered(name, file))
+
+
+def _provenance(file: str | None) -> str:
+    """What a policy's decisions depend on besides densify; a resumed run notes differences."""
+    versions = f"Python {platform.python_version()}, numpy {np.__version__}"
+    if file is None:
+        return versions
+    path = Path(file)
+    return f"{versions}, {path.name} with SHA-256 {hashlib.sha256(path.read_bytes()).hexdigest()[:16]}"
 
 
 def _table(manual: str) -> dict[str, tuple[str, str]]:

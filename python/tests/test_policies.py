@@ -429,6 +429,22 @@ def test_a_file_that_starts_a_run_when_it_is_imported_is_refused(tmp_path: Path)
         densify.import_policies(str(file))
 
 
+def test_a_resumed_run_notes_that_its_policy_has_changed(
+    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "changing.py"
+    file.write_text((EXAMPLES / "steady.py").read_text().replace('"steady"', '"changing"'))
+    folder = tmp_path / "run"
+    options = {"policy": "changing", "policy_file": [str(file)], "output": folder, **SMALL}
+    densify.train(scene, progress=False, **options)
+    saved = densify.Run(folder).config["resolved"]["policy"]
+    assert f"numpy {np.__version__}, changing.py with SHA-256" in saved
+    file.write_text(file.read_text() + "# changed\n")
+    words = ["train", str(scene), "-o", str(folder), "--resume", "--iterations", "70"]
+    done = subprocess.run([sys.executable, "-m", "densify", *words], capture_output=True, text=True)
+    assert done.returncode == 0 and f"the policy was {saved}, and is now" in done.stdout, done.stdout
+
+
 def test_comparison_of_a_class(scene: Path, tmp_path: Path) -> None:
     compared = densify.compare(
         scene,

@@ -31,6 +31,12 @@ pub trait PolicyFactory: Send + Sync {
     /// # Errors
     /// [`PolicyError::BadParameter`] when a value is out of range; any other error of the policy.
     fn build(&self, table: Table, scene: &SceneInfo) -> PolicyResult<Box<dyn DensityPolicy>>;
+
+    /// What decisions depend on besides this version of densify: the version of an interpreter, the checksum of a file.
+    /// `None` for policies that are compiled with densify.
+    fn provenance(&self) -> Option<String> {
+        None
+    }
 }
 
 impl PolicyEntry {

@@ -139,6 +139,11 @@ impl PolicyEntry {
         text.trim().to_owned() + "\n"
     }
 
+    /// See [`PolicyFactory::provenance`].
+    pub fn provenance(&self) -> Option<String> {
+        self.factory.provenance()
+    }
+
     /// The parameters that count steps and scale with the run's length.
     pub fn step_parameters(&self) -> &'static [StepParameter] {
         self.step_parameters

@@ -31,6 +31,8 @@ struct Parameter {
 /// Makes policies of a class.
 struct ClassFactory {
     class: Py<PyAny>,
+    /// Versions of Python and numpy, and the checksum of the file.
+    provenance: String,
     parameters: Vec<Parameter>,
 }
 
@@ -49,7 +51,7 @@ pub(crate) fn register(
     class: Py<PyAny>,
     about: (String, String, String, String),
     place: (String, u32),
-    identity: &str,
+    (identity, provenance): (String, String),
     parameters: Vec<Described<'_>>,
 ) -> PyResult<()> {
     let mut steps = Vec::new();
@@ -66,7 +68,7 @@ pub(crate) fn register(
     }
     let (name, summary, source, doc) = about;
     let about = (leak(&name), leak(&summary), leak(&source));
-    let factory = Box::leak(Box::new(ClassFactory { class, parameters: described }));
+    let factory = Box::leak(Box::new(ClassFactory { class, provenance, parameters: described }));
     let entry = PolicyEntry::with_factory(
         about,
         leak(&doc),
@@ -74,7 +76,7 @@ pub(crate) fn register(
         steps.leak(),
         factory,
     );
-    let added = py.detach(|| registry::add(entry, identity));
+    let added = py.detach(|| registry::add(entry, &identity));
     added.map_err(|error| PyValueError::new_err(error.to_string()))
 }
 
@@ -165,6 +167,10 @@ impl PolicyFactory for ClassFactory {
             None => Ok(typed),
             Some(unknown) => Err(format!("unknown parameter `{unknown}`")),
         }
+    }
+
+    fn provenance(&self) -> Option<String> {
+        Some(self.provenance.clone())
     }
 
     fn build(&self, table: Table, scene: &SceneInfo) -> PolicyResult<Box<dyn DensityPolicy>> {

@@ -173,7 +173,7 @@ mod tests {
     use densify_policies::policy::{Fade, Rate};
 
     use super::*;
-    use crate::spec::Partial;
+    use crate::spec::{Partial, PolicyFile};
 
     fn spec(option: &str, value: &str) -> Result<RunSpec, Failure> {
         let file: Table = format!("{option} = {value}").parse().unwrap();
@@ -218,6 +218,16 @@ mod tests {
             let message = spec("lr", bad).unwrap_err().to_string();
             assert!(message.contains(part) && message.contains("--lr"), "{bad}: {message}");
         }
+    }
+
+    #[test]
+    fn a_program_without_python_refuses_policies_in_python() {
+        let message = spec("policy_file", "[\"steady.py\"]").unwrap_err().to_string();
+        assert!(message.contains("--policy-file") && message.contains("pip install"), "{message}");
+        let parsed = |text: &str| text.parse::<PolicyFile>().map(|file| file.0);
+        assert!(parsed("steady.py").is_ok_and(|file| Path::new(&file).is_absolute()));
+        assert_eq!(parsed("my.policies").as_deref(), Ok("my.policies"));
+        assert!(parsed("").is_err());
     }
 
     #[test]
