@@ -52,6 +52,30 @@ pub fn in_range(parameter: &str, value: f64, range: impl RangeBounds<f64>) -> Po
     Err(bad_parameter(parameter, reason))
 }
 
+/// The range in a manual page: `>= a`, `> a`, or `a to b`, where `, a excluded`, `, b excluded` or `, both excluded`
+/// may follow. `None` for other forms.
+pub fn parse_range(text: &str) -> Option<(Bound<f64>, Bound<f64>)> {
+    let number = |text: &str| text.trim().parse::<f64>().ok().filter(|number| number.is_finite());
+    if let Some(low) = text.strip_prefix(">=") {
+        return Some((Bound::Included(number(low)?), Bound::Unbounded));
+    }
+    if let Some(low) = text.strip_prefix('>') {
+        return Some((Bound::Excluded(number(low)?), Bound::Unbounded));
+    }
+    let (ends, excluded) = text.split_once(", ").unwrap_or((text, ""));
+    let (low, high) = ends.split_once(" to ")?;
+    let [excludes_low, excludes_high] =
+        [low, high].map(|end| excluded == "both excluded" || excluded == format!("{end} excluded"));
+    if !excluded.is_empty() && !excludes_low && !excludes_high {
+        return None;
+    }
+    let bound = |end, excludes| {
+        let end = number(end)?;
+        Some(if excludes { Bound::Excluded(end) } else { Bound::Included(end) })
+    };
+    Some((bound(low, excludes_low)?, bound(high, excludes_high)?))
+}
+
 /// A [`PolicyError::BadParameter`], for [`ConfiguredPolicy::new`]. The registry adds the policy's name.
 ///
 /// [`ConfiguredPolicy::new`]: crate::registry::ConfiguredPolicy::new
@@ -173,6 +197,20 @@ impl<'de> Deserializer<'de> for FieldNames<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn ranges_of_manual_pages_are_parsed() {
+        use Bound::{Excluded, Included, Unbounded};
+        assert_eq!(parse_range(">= 1"), Some((Included(1.0), Unbounded)));
+        assert_eq!(parse_range("> 0.5"), Some((Excluded(0.5), Unbounded)));
+        assert_eq!(parse_range("0 to 1"), Some((Included(0.0), Included(1.0))));
+        assert_eq!(parse_range("0 to 1, both excluded"), Some((Excluded(0.0), Excluded(1.0))));
+        assert_eq!(parse_range("0 to 1, 0 excluded"), Some((Excluded(0.0), Included(1.0))));
+        assert_eq!(parse_range("-1 to 2, 2 excluded"), Some((Included(-1.0), Excluded(2.0))));
+        for other in ["", "1", "a to b", ">= x", "0 to inf", "0 to 1, 3 excluded", "low, high"] {
+            assert_eq!(parse_range(other), None, "{other}");
+        }
+    }
 
     fn reason(result: PolicyResult) -> String {
         match result {

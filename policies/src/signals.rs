@@ -310,6 +310,7 @@ impl Signals {
 /// A per-row statistic of one auxiliary view. Sums and maxima run over the pixels that the row was
 /// blended into; all columns are 0 for rows that are not on screen.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
 pub enum AuxColumn {
     /// Sum of the values of the [pixel map](crate::policy::PixelMap), not weighted by alpha, >= 0.
     MapSum,

@@ -134,8 +134,9 @@ pub fn run() -> ExitCode {
     ExitCode::from(run_with(std::env::args_os()))
 }
 
-/// Runs a command line that begins with the program's name; returns the exit code.
-fn run_with(arguments: impl IntoIterator<Item = impl Into<OsString> + Clone>) -> u8 {
+/// Runs a command line that begins with the program's name, and returns the exit code. Unlike [`run`], it is for
+/// programs that hold this one, such as Python.
+pub fn run_with(arguments: impl IntoIterator<Item = impl Into<OsString> + Clone>) -> u8 {
     let parsed = command().try_get_matches_from(arguments).and_then(|matches| {
         let arguments = Arguments::from_arg_matches(&matches)?;
         Ok((matches, arguments))
@@ -185,7 +186,8 @@ fn run_with(arguments: impl IntoIterator<Item = impl Into<OsString> + Clone>) ->
 }
 
 /// The parser, with the defaults of a run's options filled in for every command that takes such options.
-fn command() -> clap::Command {
+#[must_use]
+pub fn command() -> clap::Command {
     const WITH_RUN_OPTIONS: [&str; 9] =
         ["train", "plan", "compress", "eval", "export", "render", "report", "selftest", "view"];
     WITH_RUN_OPTIONS.iter().fold(Arguments::command(), |command, name| {

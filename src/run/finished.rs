@@ -181,7 +181,19 @@ pub fn open_alone(
     cameras: &[Camera],
     observer: &dyn Observer,
 ) -> Result<(Box<dyn Backend>, Normalisation, u8), Failure> {
-    let model = read_model_as(model, antialias, observer)?;
+    open_loaded(read_model_as(model, antialias, observer)?, (near, machine), cameras, observer)
+}
+
+/// Opens a model in memory as [`open_alone`] opens one in a file.
+///
+/// # Errors
+/// When the device cannot be opened.
+pub fn open_loaded(
+    model: Gaussians,
+    (near, machine): (Option<Fraction>, Machine),
+    cameras: &[Camera],
+    observer: &dyn Observer,
+) -> Result<(Box<dyn Backend>, Normalisation, u8), Failure> {
     let normalisation = Normalisation::fit_model(&model);
     let model = normalisation.model_from_world(model);
     let near = say_near_plane(

@@ -5,9 +5,9 @@ use std::collections::BTreeSet;
 use std::path::Path;
 
 /// Folders of the project. Files in the root belong to it too; other folders in the root do not.
-const FOLDERS: [&str; 10] = [
-    ".cargo", ".ci", ".github", "benches", "docs", "policies", "scenegen", "shaders", "src",
-    "tests",
+const FOLDERS: [&str; 11] = [
+    ".cargo", ".ci", ".github", "benches", "docs", "policies", "python", "scenegen", "shaders",
+    "src", "tests",
 ];
 /// Generated from the options of a run, so neither counted nor searched.
 const GENERATED: &str = "docs/options.md";
@@ -22,7 +22,7 @@ const THIS: &str = "tests/it/documents.rs";
 /// Parts that mark a name as a placeholder.
 const PLACEHOLDERS: [&str; 4] = ["NAME", "FORMAT", "*", "…"];
 /// Names that are allowed even though no source file contains them.
-const EXEMPT: [&str; 7] = [
+const EXEMPT: [&str; 10] = [
     // Notation for transforms.
     "a_from_b",
     "camera_from_world",
@@ -34,6 +34,10 @@ const EXEMPT: [&str; 7] = [
     "ours_ITERATION",
     // Variables of the Vulkan loader.
     "VK_DRIVER_FILES",
+    // Names of gsplat.
+    "sample_add",
+    "inject_noise",
+    "cap_max",
 ];
 /// Word limits of all documents together and of single ones.
 const MOST_WORDS: usize = 16_000;
@@ -98,7 +102,7 @@ impl Tree {
             let path = format!("{folder}/{name}");
             if !is_folder {
                 self.files.insert(path);
-            } else if name != "target" {
+            } else if name != "target" && !name.starts_with('.') {
                 self.add(&path);
             }
         }

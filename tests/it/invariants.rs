@@ -107,7 +107,7 @@ const LAYERS: [&[(&str, &str)]; 9] = [
     ],
     &[("densify-report", "src/tools/report")],
     &[("densify-cli", "src/cli")],
-    &[("densify", ".")],
+    &[("densify", "."), ("densify-python", "python")],
 ];
 
 /// The workspace packages that a package depends on directly.

@@ -56,6 +56,9 @@ pub struct Needs {
     /// ([`EditPlan::update`](crate::plan::EditPlan::update)), and children that are rotated or whose scales
     /// are set or change separately for each axis ([`ScaleRule::Axes`](crate::plan::ScaleRule::Axes)).
     pub detailed_edits: bool,
+    /// Memory that the policy itself takes at an event, beyond the values that every policy derives from its signals:
+    /// copies for another language `[bytes per row]`.
+    pub scratch_bytes: usize,
 }
 
 impl Needs {

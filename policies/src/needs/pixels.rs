@@ -16,7 +16,8 @@ use crate::signals::AuxColumn;
 ///
 /// The default is Σ w·e. A power above 1 emphasises the worst pixels, a footprint of 1 gives the mean error
 /// independent of the row's size, and a view power below 1 favours rows with errors in many views.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
 pub struct ErrorScore {
     /// The error e of a pixel.
     pub map: ErrorMap,
@@ -32,7 +33,8 @@ pub struct ErrorScore {
 
 /// The error of a pixel in an [`ErrorScore`], >= 0: the mean over channels, with I the rendering and G the
 /// photograph.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
 pub enum ErrorMap {
     /// The pixel's contribution to the training loss: 0.8 · |I − G| + 0.2 · (1 − SSIM).
     #[default]
@@ -94,7 +96,8 @@ impl ErrorScore {
 }
 
 /// Selects pixels of the training views as candidates for new rows.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct CandidateRequest {
     /// Start of the collection (exclusive) `[step]`.
     pub from: u32,
@@ -140,7 +143,8 @@ pub enum DepthMode {
 }
 
 /// Measurements in an auxiliary view: a training view rendered for one event of the policy.
-#[derive(Debug, Clone, PartialEq, Default)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
 pub struct AuxRequest {
     /// The pixel map M that [`AuxColumn::MapSum`] sums.
     pub map: PixelMap,
@@ -156,7 +160,8 @@ pub struct AuxRequest {
 /// n scales a map to 0..1 by its minimum and maximum in the view (0 where they are equal), e(p) is the
 /// mean over channels of |I − G|, and g(p) the 8-neighbour Laplacian of the 8-bit luma of the ground
 /// truth, clipped to 0..255, with repeated borders. e and g are multiplied by the image's mask.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
 pub struct PixelMap {
     /// Weight of the error, >= 0.
     pub error: f32,

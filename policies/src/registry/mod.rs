@@ -1,8 +1,15 @@
-//! The registry: policies by name, from this crate and from any other that is linked.
+//! The registry: policies by name, from this crate, from any other that is linked, and added while the program runs.
 //!
 //! [`register_policy!`](crate::register_policy) registers a policy where it is defined; there is no central
 //! list. The linker drops crates that are never named, so the main file of a program that uses an outside
-//! crate of policies says `use my_policies as _;`.
+//! crate of policies says `use my_policies as _;`. Policies of another language are [added](add) at run time.
+
+mod added;
+
+pub use added::{PolicyFactory, add, import, set_importer};
+
+use std::fmt;
+use std::marker::PhantomData;
 
 use serde::Serialize;
 use serde::de::DeserializeOwned;
@@ -56,10 +63,8 @@ macro_rules! register_policy {
 
 inventory::collect!(PolicyEntry);
 
-type BuildResult = PolicyResult<Box<dyn DensityPolicy>>;
-
 /// A registered policy.
-#[derive(Debug, Clone, Copy)]
+#[derive(Clone, Copy)]
 pub struct PolicyEntry {
     /// Name, as given on the command line.
     pub name: &'static str,
@@ -70,11 +75,37 @@ pub struct PolicyEntry {
     doc: &'static str,
     place: (&'static str, u32),
     step_parameters: &'static [StepParameter],
-    field_names: fn() -> Option<&'static [&'static str]>,
-    defaults: fn() -> Result<Table, String>,
-    /// Converts the table to the parameters' types and back.
-    typed: fn(Table) -> Result<Table, String>,
-    build: fn(Table, &SceneInfo) -> BuildResult,
+    factory: &'static dyn PolicyFactory,
+}
+
+impl fmt::Debug for PolicyEntry {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("PolicyEntry").field("name", &self.name).field("place", &self.place).finish()
+    }
+}
+
+/// Builds policies of the type `P`.
+struct Configured<P>(PhantomData<fn() -> P>);
+
+impl<P: ConfiguredPolicy> PolicyFactory for Configured<P> {
+    fn parameter_names(&self) -> Vec<String> {
+        let known = field_names::<P::Params>().unwrap_or_default();
+        known.iter().map(|name| (*name).to_owned()).collect()
+    }
+
+    fn defaults(&self) -> Result<Table, String> {
+        Table::try_from(P::Params::default()).map_err(first_line)
+    }
+
+    fn typed(&self, table: Table) -> Result<Table, String> {
+        let params: P::Params = table.try_into().map_err(first_line)?;
+        Table::try_from(params).map_err(first_line)
+    }
+
+    fn build(&self, table: Table, scene: &SceneInfo) -> PolicyResult<Box<dyn DensityPolicy>> {
+        let params = table.try_into().map_err(|e| PolicyError::Other(first_line(e)))?;
+        Ok(Box::new(P::new(params, scene)?))
+    }
 }
 
 impl PolicyEntry {
@@ -86,24 +117,9 @@ impl PolicyEntry {
         doc: &'static str,
         place: (&'static str, u32),
     ) -> Self {
-        Self {
-            name,
-            summary,
-            source,
-            doc,
-            place,
-            step_parameters: P::STEP_PARAMETERS,
-            field_names: field_names::<P::Params>,
-            defaults: || Table::try_from(P::Params::default()).map_err(first_line),
-            typed: |table| {
-                let params: P::Params = table.try_into().map_err(first_line)?;
-                Table::try_from(params).map_err(first_line)
-            },
-            build: |table, scene| {
-                let params = table.try_into().map_err(|e| PolicyError::Other(first_line(e)))?;
-                Ok(Box::new(P::new(params, scene)?))
-            },
-        }
+        let step_parameters = P::STEP_PARAMETERS;
+        let factory = const { &Configured::<P>(PhantomData) };
+        Self { name, summary, source, doc, place, step_parameters, factory }
     }
 
     /// The place where the policy is registered (file:line).
@@ -123,6 +139,11 @@ impl PolicyEntry {
         text.trim().to_owned() + "\n"
     }
 
+    /// See [`PolicyFactory::provenance`].
+    pub fn provenance(&self) -> Option<String> {
+        self.factory.provenance()
+    }
+
     /// The parameters that count steps and scale with the run's length.
     pub fn step_parameters(&self) -> &'static [StepParameter] {
         self.step_parameters
@@ -130,10 +151,12 @@ impl PolicyEntry {
 
     /// Names of all parameters, in declaration order.
     pub fn parameter_names(&self) -> Vec<String> {
-        let known = (self.field_names)().unwrap_or_default();
-        let mut names: Vec<String> = known.iter().map(|name| (*name).to_owned()).collect();
-        let in_defaults = self.defaults().unwrap_or_default().into_iter().map(|(name, _)| name);
-        names.extend(in_defaults.filter(|name| !known.contains(&name.as_str())));
+        let mut names = self.factory.parameter_names();
+        for (name, _) in self.defaults().unwrap_or_default() {
+            if !names.contains(&name) {
+                names.push(name);
+            }
+        }
         names
     }
 
@@ -142,8 +165,8 @@ impl PolicyEntry {
     /// [`build`](Self::build) then returns the error.
     pub fn parameters(&self) -> Vec<(String, Value)> {
         let mut defaults = self.defaults().unwrap_or_default();
-        let known = (self.field_names)().unwrap_or_default();
-        let in_order = known.iter().filter_map(|name| defaults.remove_entry(*name));
+        let known = self.factory.parameter_names();
+        let in_order = known.iter().filter_map(|name| defaults.remove_entry(name.as_str()));
         let mut listed: Vec<(String, Value)> = in_order.collect();
         listed.extend(defaults);
         listed
@@ -163,13 +186,13 @@ impl PolicyEntry {
         for (parameter, value) in set {
             // One at a time, so that the error can name the parameter.
             table.insert(parameter.clone(), value.clone());
-            (self.typed)(table.clone()).map_err(|reason| PolicyError::BadParameter {
+            self.factory.typed(table.clone()).map_err(|reason| PolicyError::BadParameter {
                 policy: self.name.to_owned(),
                 parameter: parameter.clone(),
                 reason: format!("{value} does not fit: {reason}"),
             })?;
         }
-        (self.typed)(table).map_err(|reason| self.bad_defaults(&reason))
+        self.factory.typed(table).map_err(|reason| self.bad_defaults(&reason))
     }
 
     /// Builds the policy with the parameters in `set` and [effective](Self::effective) defaults.
@@ -178,7 +201,7 @@ impl PolicyEntry {
     /// [`PolicyError::UnknownParameter`]; [`PolicyError::BadParameter`] for a wrong type or a
     /// value out of range; any other error of the policy.
     pub fn build(&self, set: &Table, scene: &SceneInfo) -> PolicyResult<Box<dyn DensityPolicy>> {
-        (self.build)(self.effective(set, scene)?, scene).map_err(|error| match error {
+        self.factory.build(self.effective(set, scene)?, scene).map_err(|error| match error {
             PolicyError::BadParameter { parameter, reason, .. } => {
                 PolicyError::BadParameter { policy: self.name.to_owned(), parameter, reason }
             }
@@ -199,7 +222,7 @@ impl PolicyEntry {
     }
 
     fn defaults(&self) -> PolicyResult<Table> {
-        (self.defaults)().map_err(|reason| self.bad_defaults(&reason))
+        self.factory.defaults().map_err(|reason| self.bad_defaults(&reason))
     }
 
     fn bad_defaults(&self, reason: &str) -> PolicyError {
@@ -211,12 +234,12 @@ impl PolicyEntry {
     }
 }
 
-/// All policies, sorted by name, as the order of the linker is arbitrary.
+/// All policies, sorted by name, as the order of the linker and of additions is arbitrary.
 ///
 /// # Errors
 /// [`PolicyError::DuplicateName`] when two have the same name.
 pub fn policies() -> PolicyResult<Vec<&'static PolicyEntry>> {
-    sorted(inventory::iter::<PolicyEntry>.into_iter().collect())
+    sorted(linked().chain(added::all()).collect())
 }
 
 /// The policy of this name.
@@ -229,6 +252,11 @@ pub fn find(name: &str) -> PolicyResult<&'static PolicyEntry> {
         name: name.to_owned(),
         nearest: nearest(name, all.iter().map(|entry| entry.name)),
     })
+}
+
+/// The policies that are part of the program.
+fn linked() -> impl Iterator<Item = &'static PolicyEntry> {
+    inventory::iter::<PolicyEntry>.into_iter()
 }
 
 fn sorted(mut entries: Vec<&PolicyEntry>) -> PolicyResult<Vec<&PolicyEntry>> {

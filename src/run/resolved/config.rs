@@ -60,6 +60,10 @@ pub struct Findings {
     pub init_model: Option<ModelSize>,
     /// The model whose Gaussians never change.
     pub frozen: Option<ModelSize>,
+    /// What the policy's decisions depend on besides densify, such as the version of Python; not in the file of a policy
+    /// that is a part of densify.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub policy: Option<String>,
 }
 
 /// The size of a model in a file.
@@ -168,6 +172,7 @@ impl RunConfig {
             has_exposures: choices.exposure.is_on,
             init_model: inputs.init_model,
             frozen: inputs.frozen_model,
+            policy: choices.entry.provenance(),
         };
         Ok(Self {
             densify: env!("CARGO_PKG_VERSION").to_owned(),

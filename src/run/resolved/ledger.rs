@@ -226,7 +226,8 @@ impl Case<'_> {
         let points = aux.map_or(0, |request| u64::from(request.points));
         // The policy keeps a point, makes a seed of it, and compiles the seed.
         let plan = bytes_per_row(needs) as u64;
-        size.rows as u64 * ((signals + columns) * float + plan + PLANNING_BYTES)
+        let own = needs.scratch_bytes as u64;
+        size.rows as u64 * ((signals + columns) * float + plan + PLANNING_BYTES + own)
             + points * self.inputs.dataset.train.len() as u64 * (candidate + 3 * seed)
     }
 

@@ -67,6 +67,7 @@ pub(super) fn prepare(
     let fingerprint = Fingerprint::new(&run.case.inputs.dataset);
     if let Some(resumed) = &resumed {
         resume::check(&config, resumed, &fingerprint, &output)?;
+        resume::note_provenance(&config, resumed, observer);
     }
     announce(&run, &training, &output, observer);
     let ResolvedRun { case, size, .. } = &run;

@@ -165,6 +165,18 @@ fn check_restart(
     Ok(())
 }
 
+/// Tells the user if the policy may decide otherwise than before, as it depends on other programs or its file has
+/// changed.
+pub(super) fn note_provenance(now: &RunConfig, resumed: &Resumed, observer: &dyn Observer) {
+    if let (Some(now), Some(saved)) = (&now.resolved.policy, &resumed.config.resolved.policy)
+        && now != saved
+    {
+        observer.say(format_args!(
+            "note: the policy was {saved}, and is now {now}; results may differ"
+        ));
+    }
+}
+
 /// Fails if the result of this run would differ from that of the saved run, or if their datasets differ.
 pub(super) fn check(
     now: &RunConfig,

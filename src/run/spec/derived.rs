@@ -4,7 +4,7 @@
 use std::path::{Path, PathBuf};
 
 use densify_policies::policy::RateOverrides;
-use densify_policies::registry::{PolicyEntry, find};
+use densify_policies::registry::{PolicyEntry, find, import};
 use toml::{Table, Value};
 
 use super::knobs::Knobs;
@@ -132,11 +132,22 @@ impl RunSpec {
         rates.problem().map_or(Ok(rates), |problem| Err(fail(&problem)))
     }
 
+    /// Imports the policies of `--policy-file`.
+    ///
+    /// # Errors
+    /// When this program cannot run Python, or an import fails.
+    pub(crate) fn import_policies(&self) -> Result<(), Failure> {
+        self.density.policy_file.iter().try_for_each(|file| {
+            import(&file.0).map_err(|error| OptionProblem::value("policy_file", error).into())
+        })
+    }
+
     /// The policy, and the parameters that are set for it.
     ///
     /// # Errors
     /// When the policy does not exist, or a parameter is set to two values.
     pub fn policy(&self) -> Result<(&'static PolicyEntry, Table), Failure> {
+        self.import_policies()?;
         let entry = find(&self.density.policy)?;
         let mut tables = values::table(&self.density.policy_set)
             .map_err(|problem| OptionProblem::Conflict { option: "policy_set", problem })?;
@@ -163,7 +174,7 @@ mod tests {
     use densify_policies::policy::{Fade, Rate};
 
     use super::*;
-    use crate::spec::Partial;
+    use crate::spec::{Partial, PolicyFile};
 
     fn spec(option: &str, value: &str) -> Result<RunSpec, Failure> {
         let file: Table = format!("{option} = {value}").parse().unwrap();
@@ -208,6 +219,16 @@ mod tests {
             let message = spec("lr", bad).unwrap_err().to_string();
             assert!(message.contains(part) && message.contains("--lr"), "{bad}: {message}");
         }
+    }
+
+    #[test]
+    fn a_program_without_python_refuses_policies_in_python() {
+        let message = spec("policy_file", "[\"steady.py\"]").unwrap_err().to_string();
+        assert!(message.contains("--policy-file") && message.contains("pip install"), "{message}");
+        let parsed = |text: &str| text.parse::<PolicyFile>().map(|file| file.0);
+        assert!(parsed("steady.py").is_ok_and(|file| Path::new(&file).is_absolute()));
+        assert_eq!(parsed("my.policies").as_deref(), Ok("my.policies"));
+        assert!(parsed("").is_err());
     }
 
     #[test]

@@ -14,8 +14,8 @@ pub(crate) use overlay::NOT_OPTIONS;
 pub use overlay::Partial;
 pub(crate) use values::assignments;
 pub use values::{
-    AbsolutePath, Assignment, Budget, ByteCount, Fraction, ImageCache, InitChoice, Rows, ShDegree,
-    Threads, Whole,
+    AbsolutePath, Assignment, Budget, ByteCount, Fraction, ImageCache, InitChoice, PolicyFile,
+    Rows, ShDegree, Threads, Whole,
 };
 
 use std::num::NonZeroU32;
@@ -250,6 +250,11 @@ run_spec! {
         /// Set a parameter of the policy, such as diet.rho=0.2; may be repeated
         #[serde(with = "as_table")]
         policy_set: Vec<Assignment> = Vec::new(), Fixed, value "POLICY.NAME=VALUE";
+
+        /// Python file (.py) or module with policies, which are then known by name; may be repeated. Only the densify
+        /// that pip installs can run them
+        #[serde(skip_serializing_if = "Vec::is_empty")]
+        policy_file: Vec<PolicyFile> = Vec::new(), Free, value "FILE|MODULE";
     }
 
     /// Training.

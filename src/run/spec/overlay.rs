@@ -173,6 +173,7 @@ fn join(upper: Table, lower: &mut Table) {
 
 /// Checks the names in options that have several members: knobs, learning rates, policies.
 fn check_names(spec: &RunSpec) -> Result<(), Failure> {
+    spec.import_policies()?;
     spec.knobs()?;
     spec.learning_rates(&RateOverrides::default(), 1.0)?;
     for setting in &spec.density.policy_set {

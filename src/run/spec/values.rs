@@ -1,7 +1,7 @@
 //! Types of options that are more than a number or a word: their spelling on the command line and in files, and their
 //! range.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
@@ -85,6 +85,11 @@ pub enum ShDegree {
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(transparent)]
 pub struct AbsolutePath(pub PathBuf);
+
+/// `--policy-file`: a Python file by its absolute path, or the name of a Python module.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(transparent)]
+pub struct PolicyFile(pub String);
 
 /// `--init`: the source of the first Gaussians.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -193,6 +198,22 @@ impl FromStr for AbsolutePath {
         }
         let path = std::path::absolute(text);
         path.map(Self).map_err(|error| format!("`{text}` is not a path: {error}"))
+    }
+}
+
+impl FromStr for PolicyFile {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        if text.is_empty() {
+            return Err("give a Python file or module".to_owned());
+        }
+        let is_file = Path::new(text).extension().is_some_and(|ending| ending == "py");
+        if !is_file {
+            return Ok(Self(text.to_owned()));
+        }
+        let path = std::path::absolute(text).ok().and_then(|path| path.to_str().map(str::to_owned));
+        path.map(Self).ok_or_else(|| format!("`{text}` is not a path in UTF-8"))
     }
 }
 

@@ -8,6 +8,7 @@ mod slurm;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
+use std::sync::OnceLock;
 
 use clap::Args;
 use serde::{Deserialize, Serialize};
@@ -136,7 +137,7 @@ impl Batch {
 
     /// The command line of a task, up to its name.
     fn command_line(&self) -> Result<Vec<String>, Failure> {
-        Ok([&[utf8(&program()?)?.to_owned()], &self.command[..]].concat())
+        Ok([program()?, self.command.clone()].concat())
     }
 }
 
@@ -255,14 +256,38 @@ fn run_scheduler(program: &str, arguments: &[&str], remedy: &str) -> Result<Stri
     )))
 }
 
-/// Path of the running program, which also executes submitted tasks.
+/// The words that start this program, if they are not the path of the process's own.
+static PROGRAM: OnceLock<Vec<String>> = OnceLock::new();
+
+/// Sets the words that start this program in another process, for a library within another program: `python -m densify`.
+/// Only the first call has an effect.
+pub fn set_program(words: Vec<String>) {
+    let _ = PROGRAM.set(words);
+}
+
+/// The words that start this program, which also executes submitted tasks.
 ///
 /// # Errors
-/// If the system does not report it.
-pub fn program() -> Result<PathBuf, Failure> {
-    std::env::current_exe().map_err(|error| {
+/// If the system does not report the program, or its path is not UTF-8.
+pub fn program() -> Result<Vec<String>, Failure> {
+    if let Some(words) = PROGRAM.get().filter(|words| !words.is_empty()) {
+        return Ok(words.clone());
+    }
+    let path = std::env::current_exe().map_err(|error| {
         Failure::new(OTHER, format!("cannot find the program that is running: {error}"))
-    })
+    })?;
+    Ok(vec![utf8(&path)?.to_owned()])
+}
+
+/// The command that starts this program.
+///
+/// # Errors
+/// As [`program`].
+pub fn program_command() -> Result<Command, Failure> {
+    let words = program()?;
+    let mut command = Command::new(&words[0]);
+    command.args(&words[1..]);
+    Ok(command)
 }
 
 /// A path as text, for commands and run descriptions.

@@ -19,7 +19,7 @@ pub mod window;
 
 use std::path::{Path, PathBuf};
 
-pub use compare::Comparison;
+pub use compare::{Comparison, SceneBudget};
 pub use engines::{EngineArgs, StudyRun};
 pub use trade::Trade;
 

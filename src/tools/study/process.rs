@@ -4,7 +4,7 @@ use std::path::Path;
 use std::process::{Command, Stdio};
 
 use densify_core::files::write_atomically;
-use densify_launch::program;
+use densify_launch::program_command;
 use densify_run::failure::{Failure, OTHER};
 use densify_run::{Partial, RunSpec};
 
@@ -15,7 +15,7 @@ pub(super) fn train(spec: &Partial, folder: &Path) -> Result<(), Failure> {
     file.push(".toml");
     let text = toml::to_string(spec).map_err(Failure::input)?;
     write_atomically(Path::new(&file), |out| out.write_all(text.as_bytes()))?;
-    let mut command = Command::new(program()?);
+    let mut command = program_command()?;
     command.arg("train").arg("--config").arg(file).args(["--overwrite", "--quiet", "--output"]);
     wait_for(command.arg(folder))
 }
@@ -23,7 +23,7 @@ pub(super) fn train(spec: &Partial, folder: &Path) -> Result<(), Failure> {
 /// Evaluates a trained run with `densify eval`, on the device that trained it.
 pub(super) fn evaluate(spec: &Partial, folder: &Path) -> Result<(), Failure> {
     let RunSpec { start, device, .. } = spec.clone().describe()?;
-    let mut command = Command::new(program()?);
+    let mut command = program_command()?;
     command.arg("eval").arg(folder);
     command.arg("--scene").arg(start.scene.unwrap_or_default());
     command.args(["--backend", device.backend.word()]);

@@ -8,7 +8,7 @@ use std::path::Path;
 use densify_scenegen::PresetSpec;
 
 pub use rendered::GroundTruth;
-pub use rendered::cache_folder;
+pub use rendered::{cache_folder, set_program_file};
 pub(super) use rendered::{load, surface_bytes};
 
 /// Prefix of the paths of built-in scenes.

@@ -19,7 +19,7 @@ use crate::dataset::{self, Dataset, LoadError, LoadOptions, PointCloud, View};
 use densify_core::camera::Camera;
 use densify_core::image::Image8;
 use scene_cache::Entry;
-pub use scene_cache::cache_folder;
+pub use scene_cache::{cache_folder, set_program_file};
 
 /// Upper bound on the memory for building a surface's search tree, as a multiple of the size of the surface or its
 /// file: a triangle takes 86 bytes in the file, up to 200 while the tree is built, and 100 afterwards.

@@ -5,6 +5,7 @@ use std::collections::HashMap;
 use std::fs::{self, File};
 use std::io::{self, Read};
 use std::path::{Path, PathBuf};
+use std::sync::OnceLock;
 use std::time::SystemTime;
 
 use densify_scenegen::{Frame, InitPoints, Options};
@@ -21,6 +22,14 @@ const MAX_BYTES: u64 = 1 << 30;
 const EXTENSION: &str = "safetensors";
 const CHECKSUM: &str = "crc32c";
 
+/// The file with the code of densify, if it is not the program of the process.
+static PROGRAM_FILE: OnceLock<PathBuf> = OnceLock::new();
+
+/// Names the file with the code of densify, for a library within another program. Only the first call has an effect.
+pub fn set_program_file(file: PathBuf) {
+    let _ = PROGRAM_FILE.set(file);
+}
+
 /// The folder of cached scenes, if the user has a cache folder.
 pub fn cache_folder() -> Option<PathBuf> {
     let base = etcetera::choose_base_strategy().ok()?;
@@ -35,7 +44,11 @@ pub(super) struct Entry {
 impl Entry {
     /// The entry of the built-in scene `name`; `None` if the program's own file cannot be read.
     pub(super) fn new(folder: &Path, name: &str, options: &Options) -> Option<Self> {
-        let program = file_checksum(&std::env::current_exe().ok()?).ok()?;
+        let program = match PROGRAM_FILE.get() {
+            Some(file) => file.clone(),
+            None => std::env::current_exe().ok()?,
+        };
+        let program = file_checksum(&program).ok()?;
         let parameters = crc32c::crc32c(format!("{options:?}").as_bytes());
         // Some systems do not allow the colon of `town:4` in file names.
         let name = name.replace(':', "-");

@@ -1,0 +1,54 @@
+//! Options of a run from Python: keyword arguments, which arrive as JSON and are checked as a TOML table.
+
+use densify_run::failure::Failure;
+use densify_run::{Partial, RunSpec};
+use toml::{Table, Value};
+
+/// The origin of options in messages.
+const ORIGIN: &str = "options";
+
+/// A JSON value as a TOML value; `None` for null, which TOML does not have.
+fn to_toml(value: serde_json::Value) -> Result<Option<Value>, Failure> {
+    Ok(Some(match value {
+        serde_json::Value::Null => return Ok(None),
+        serde_json::Value::Bool(flag) => Value::Boolean(flag),
+        serde_json::Value::String(text) => Value::String(text),
+        serde_json::Value::Number(number) => match (number.as_i64(), number.as_f64()) {
+            (Some(integer), _) => Value::Integer(integer),
+            (None, Some(float)) if number.is_f64() => Value::Float(float),
+            _ => return Err(Failure::input(format!("{number} is too large for an option"))),
+        },
+        serde_json::Value::Array(items) => {
+            let items = items.into_iter().map(to_toml).collect::<Result<Vec<_>, _>>()?;
+            Value::Array(items.into_iter().flatten().collect())
+        }
+        serde_json::Value::Object(members) => {
+            let mut table = Table::new();
+            for (name, member) in members {
+                if let Some(member) = to_toml(member)? {
+                    table.insert(name, member);
+                }
+            }
+            Value::Table(table)
+        }
+    }))
+}
+
+/// A JSON object as a TOML table.
+pub(crate) fn table(json: &str) -> Result<Table, Failure> {
+    let value: serde_json::Value = serde_json::from_str(json).map_err(Failure::input)?;
+    match to_toml(value)? {
+        Some(Value::Table(table)) => Ok(table),
+        _ => Err(Failure::input("the options are not a table")),
+    }
+}
+
+/// The options of a JSON object, checked one by one.
+pub(crate) fn partial(json: &str) -> Result<Partial, Failure> {
+    Partial::new(table(json)?, ORIGIN)
+}
+
+/// The run that a JSON object describes, over its preset and the defaults.
+pub(crate) fn spec(json: &str) -> Result<RunSpec, Failure> {
+    partial(json)?.describe()
+}

@@ -1,0 +1,484 @@
+"""Policies written in Python: they plan as those in Rust, and mistakes are exceptions of the usual types."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import densify
+
+from .conftest import SMALL
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+sys.path.insert(0, str(EXAMPLES))
+
+from steady import Steady  # noqa: E402
+
+from .vanilla_in_python import Vanilla  # noqa: E402
+
+MANUAL = """# test
+
+| name | default | range | unit | meaning |
+|---|---|---|---|---|
+| every | 10 | >= 1 | steps | interval |
+"""
+
+
+def make(name: str, plan: Any, signals: Any = ("opacity",), **more: Any) -> type:
+    """Registers a policy whose plan is a function of now, rng and plan."""
+    needs = densify.Needs(signals=signals, **more.pop("needs", {}))
+    members = {
+        "__doc__": MANUAL.replace("10", str(more.get("every", 10))),
+        "__annotations__": {"every": int, **{key: int for key in more if not callable(more[key])}},
+        "__module__": __name__,
+        "every": 10,
+        "needs": lambda self, scene: needs,
+        "is_due": lambda self, step: step % self.every == 0,
+        "plan": plan if plan.__code__.co_argcount == 4 else lambda self, *event: plan(*event),
+        **more,
+    }
+    return densify.policy(name, summary="a test", source="a test")(type(name, (), members))
+
+
+def train(scene: Path, policy: Any, folder: Path, **options: Any) -> densify.Run:
+    return densify.train(
+        scene, policy=policy, output=folder, progress=False, **{**SMALL, **options}
+    )
+
+
+def fails(scene: Path, plan: Any, folder: Path, **more: Any) -> densify.PolicyError:
+    with pytest.raises(densify.PolicyError) as raised:
+        train(scene, make(f"p{abs(hash(folder))}", plan, **more), folder)
+    # The run keeps its model, and its message says where the policy has failed.
+    assert (folder / "point_cloud").is_dir() and "test_policies.py:" in str(raised.value)
+    return raised.value
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"tau": 1e-5, "grow_every": 10, "grow_from": 5, "grow_until": 55, "reset_every": 25},
+        {"governor": True, "grow_every": 10, "grow_from": 5, "grow_until": 55, "max_scale_from": 20},
+    ],
+)
+def test_vanilla_in_python_gives_the_bytes_of_vanilla_in_rust(
+    scene: Path, tmp_path: Path, settings: dict[str, Any]
+) -> None:
+    ours = train(scene, Vanilla(**settings), tmp_path / "a")
+    theirs = train(scene, "vanilla", tmp_path / "b", policy_set={"vanilla": settings})
+    assert ours.events == theirs.events and any(event["added"] for event in ours.events)
+    model = "point_cloud/iteration_60/point_cloud.ply"
+    assert (ours.folder / model).read_bytes() == (theirs.folder / model).read_bytes()
+
+
+def test_a_policy_of_40_lines_does_what_that_in_rust_does(scene: Path, tmp_path: Path) -> None:
+    lines = [line for line in (EXAMPLES / "steady.py").read_text().splitlines() if line.strip()]
+    assert len(lines[lines.index("import numpy as np") :]) <= 40
+    run = train(scene, Steady(grow_every=10, grow_until=60), tmp_path / "run", budget=220)
+    # As in tests/outside_policy: ten of 200 rows are split per event until the budget is reached.
+    assert [event["cause"] for event in run.events] == ["steady"] * 5
+    assert [event["after"] for event in run.events] == [210, 220, 220, 220, 220]
+    assert any(event["denied"] for event in run.events)
+
+
+def test_policies_conform_and_are_listed() -> None:
+    for policy in (Steady, Vanilla):
+        densify.check_policy(policy)
+    info = next(info for info in densify.policies() if info.name == "steady")
+    assert info.parameters == {"grow_every": "100", "grow_until": "15000"}
+    assert info.manual.startswith("# steady") and "steady.py:" in info.place
+    with pytest.raises(densify.DensifyError, match="leaves at least one row"):
+        densify.check_policy(make("all_gone", lambda now, rng, plan: plan.prune(range(now.rows))))
+    reads_undeclared = make("undeclared", lambda now, rng, plan: now["age"])
+    with pytest.raises(densify.DensifyError, match="age was read but not declared"):
+        densify.check_policy(reads_undeclared)
+
+
+def test_ranges_of_the_manual_page_are_enforced(scene: Path, tmp_path: Path) -> None:
+    with pytest.raises(densify.InputError, match="`steady.grow_every`: 0 is out of range"):
+        train(scene, Steady(grow_every=0), tmp_path / "run")
+    with pytest.raises(densify.InputError, match="did you mean `grow_every`"):
+        train(scene, "steady", tmp_path / "run", policy_set={"steady": {"grow_evry": 1}})
+    with pytest.raises(densify.InputError, match="did you mean `steady`"):
+        train(scene, "steadi", tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_classes_that_cannot_be_policies_are_refused() -> None:
+    def register(name: str = "refused", **members: Any) -> None:
+        plan = {"needs": lambda self, scene: None, "is_due": None, "plan": lambda self, *event: None}
+        plan["is_due"] = lambda self, step: True
+        body = {"__doc__": MANUAL, "__annotations__": {"every": int}, "every": 10, **plan, **members}
+        densify.policy(name, summary="", source="")(type("Refused", (), body))
+
+    for members, error, message in [
+        ({"__doc__": None}, ValueError, "docstring"),
+        ({"__doc__": "# no table"}, ValueError, "no row for the parameter `every`"),
+        ({"__doc__": MANUAL.replace("10", "20")}, ValueError, "default 10, not 20"),
+        ({"__doc__": MANUAL.replace(">= 1", "some")}, ValueError, "range `some`"),
+        ({"__doc__": MANUAL + "| x | 1 | | | |\n"}, ValueError, "`x` is not a parameter"),
+        ({"every": [1]}, (TypeError, ValueError), "every|list"),
+        ({"plan": None}, TypeError, "no method `plan`"),
+        ({"name": "diet"}, ValueError, "`diet` is registered twice"),
+    ]:
+        with pytest.raises(error, match=message):
+            register(members.pop("name", "refused"), **members)
+    assert all(info.name != "refused" for info in densify.policies())
+
+
+def test_the_same_class_again_replaces(scene: Path, tmp_path: Path) -> None:
+    make("again", lambda now, rng, plan: plan.cause("first"))
+    make("again", lambda now, rng, plan: (plan.prune([0]), plan.cause("second")))
+    assert {event["cause"] for event in train(scene, "again", tmp_path / "run").events} == {"second"}
+
+    class Other:
+        __doc__ = MANUAL
+        every: int = 10
+
+        def needs(self, scene: densify.Scene) -> densify.Needs:
+            return densify.Needs()
+
+        def is_due(self, step: int) -> bool:
+            return False
+
+        def plan(self, now: densify.Now, rng: densify.Rng, plan: densify.Plan) -> None:
+            pass
+
+    with pytest.raises(ValueError, match="registered twice"):
+        densify.policy("again", summary="", source="")(Other)
+
+
+def test_a_class_that_cannot_be_constructed_ends_the_run_before_it_begins(scene: Path, tmp_path: Path) -> None:
+    def broken(self: Any) -> None:
+        raise RuntimeError("no licence")
+
+    policy = make("unmade", lambda now, rng, plan: None, __post_init__=broken)
+    with pytest.raises(densify.InputError, match="no licence") as raised:
+        train(scene, policy, tmp_path / "run")
+    assert isinstance(raised.value.__cause__, RuntimeError) and not (tmp_path / "run").exists()
+    for needs, message in [
+        ({"signals": ["opaciti"]}, "opaciti"),
+        ({"least_resolution": 2.0}, "least_resolution is 2"),
+        ({"full_depth": float("nan")}, "JSON"),
+    ]:
+        policy = make("unmade", lambda now, rng, plan: None, needs=needs, signals=needs.pop("signals", ()))
+        with pytest.raises(densify.InputError, match=message):
+            train(scene, policy, tmp_path / "run")
+
+
+@pytest.mark.parametrize(
+    ("edit", "error", "message"),
+    [
+        (lambda plan: plan.prune([-1]), IndexError, "no row -1"),
+        (lambda plan: plan.prune(np.array([2**63], dtype=np.uint64)), IndexError, "no row"),
+        (lambda plan: plan.prune([0, 10_000]), IndexError, "no row 10000"),
+        (lambda plan: plan.prune([0.5]), TypeError, "integers or a mask"),
+        (lambda plan: plan.prune("no"), TypeError, "dimension|integers"),
+        (lambda plan: plan.prune([[0]]), TypeError, "one dimension"),
+        (lambda plan: plan.prune([True, False]), ValueError, "the mask has 2 entries"),
+        (lambda plan: plan.grow([0], densify.split(float("nan"))), ValueError, "`scale` is not finite"),
+        (lambda plan: plan.grow([0], densify.clone(float("nan"))), ValueError, "3 numbers"),
+        (lambda plan: plan.grow([0], densify.Offspring(children=0)), ValueError, "children"),
+        (lambda plan: plan.grow([0, 1], densify.Offspring(children=[1, 1, 1])), ValueError, "each of 2"),
+        (lambda plan: plan.grow([0], 1.6), TypeError, "densify.split"),
+        (lambda plan: plan.grow([0], densify.Offspring(opacity="more")), ValueError, "conserved"),
+        (lambda plan: plan.grow([0], densify.Offspring(opacity=0.5)), TypeError, "densify.by"),
+        (lambda plan: plan.grow([0], densify.Offspring(turn=[1.0, 0.1, 0.0, 0.0])), densify.Undeclared, "detailed"),
+        (lambda plan: plan.update([0], colour=[0.1, 0.2, 0.3]), densify.Undeclared, "detailed_edits"),
+        (lambda plan: plan.append([[0.0, 0.0, np.nan]], [0.5] * 3, 0.1, 0.5), ValueError, "position"),
+        (lambda plan: plan.append([0.0, 0.0, 0.0], [0.5] * 3, 0.1, 0.5), ValueError, "shape"),
+        (lambda plan: plan.append([["a", "b", "c"]], [0.5] * 3, 0.1, 0.5), TypeError, "numbers"),
+        (lambda plan: plan.append([[0j, 0j, 0j]], [0.5] * 3, 0.1, 0.5), TypeError, "numbers"),
+        (lambda plan: plan.clamp_opacity(1.5), ValueError, "max"),
+        (lambda plan: plan.decay(opacity=-1.0), ValueError, "opacity"),
+        (lambda plan: plan.decay(seen_only=True), densify.Undeclared, "visible_count"),
+        (lambda plan: plan.reset("all"), ValueError, "signals, candidates"),
+        (lambda plan: plan.reset(["opaciti"]), ValueError, "opaciti"),
+    ],
+)
+def test_wrong_edits_are_exceptions(
+    scene: Path, tmp_path: Path, edit: Any, error: type[Exception], message: str
+) -> None:
+    def plan(now: densify.Now, rng: densify.Rng, plan: densify.Plan) -> None:
+        with pytest.raises(error, match=message):
+            edit(plan)
+        edit(plan)
+
+    raised = fails(scene, plan, tmp_path / "run")
+    assert isinstance(raised.__cause__, error) and "step 10" in str(raised)
+
+
+def test_refused_edits_are_false_and_counted(scene: Path, tmp_path: Path) -> None:
+    seen: dict[str, Any] = {}
+
+    def plan(now: densify.Now, rng: densify.Rng, plan: densify.Plan) -> None:
+        seen["twice"] = plan.prune([0, 1, 1]).tolist()
+        seen["taken"] = plan.grow(np.array([1, 2], dtype=np.int8), densify.clone()).tolist()
+        mask = np.zeros(now.rows, bool)
+        mask[3:5] = True
+        seen["mask"] = plan.grow(mask, densify.split(np.array([1.5, 2.0]), opacity="conserved")).tolist()
+        seen["room"] = plan.room
+        seen["beyond"] = int(plan.append(np.zeros((400, 3)), [0.5] * 3, 0.1, 0.5).sum())
+        seen["free"] = int(plan.free.sum())
+
+    run = train(scene, make("refused_edits", plan, every=60), tmp_path / "run", budget=250)
+    assert seen["twice"] == [True, True, False] and seen["taken"] == [False, True]
+    assert seen["mask"] == [True, True] and seen["room"] == seen["beyond"] == 49 and seen["free"] == 195
+    (event,) = run.events
+    assert (event["before"], event["after"], event["denied"]) == (200, 250, 353)
+
+
+def test_detailed_edits(scene: Path, tmp_path: Path) -> None:
+    def plan(now: densify.Now, rng: densify.Rng, plan: densify.Plan) -> None:
+        rows = np.arange(4)
+        assert plan.update(rows, opacity=densify.to([0.1, 0.2, 0.3, 0.4]), scale=densify.to(0.2)).all()
+        assert plan.update([4], position=[0.0, 0.1, 0.2], colour=[0.1, 0.2, 0.3], keep_moments=False).all()
+        turned = densify.Offspring(
+            children=[1, 2], scale=densify.by([[1.0, 0.5, 0.25]] * 2), turn=[0.0, 1.0, 0.0, 0.0]
+        )
+        assert plan.grow([6, 7], turned).all()
+        assert plan.grow([8], densify.split_long_axis(0.45, 0.6)).all()
+        assert plan.append([[0.0, 0.0, 0.0]], [0.5, 0.5, 0.5], [0.1, 0.2, 0.3], 0.5, [1.0, 0.0, 0.0, 0.0]).all()
+
+    policy = make("detailed", plan, needs={"detailed_edits": True}, every=60)
+    (event,) = train(scene, policy, tmp_path / "run").events
+    assert (event["added"], event["updated"]) == (5, 6)
+
+
+def test_inputs_are_copies_that_cannot_be_written(scene: Path, tmp_path: Path) -> None:
+    kept: list[Any] = []
+    names = ("opacity", "position", "orientation", "visible_count")
+
+    def plan(now: densify.Now, rng: densify.Rng, plan: densify.Plan) -> None:
+        assert now["opacity"].shape == (now.rows,) and now["orientation"].shape == (now.rows, 4)
+        for name in names:
+            assert now[name].dtype == np.float32
+            with pytest.raises(ValueError, match="read-only"):
+                now[name][0] = 1.0
+            # Unlocking a copy harms nothing.
+        with pytest.raises(KeyError, match="did you mean `opacity`"):
+            now["opacitie"]  # type: ignore[index]
+        with pytest.raises(KeyError, match="not declared"):
+            now["age"]
+        kept.append((now, now["opacity"], now["opacity"].copy(), plan, rng))
+        plan.prune([0])
+
+    train(scene, make("keeps", plan, signals=names), tmp_path / "run")
+    assert len(kept) == 6
+    for now, opacity, copy, plan_object, rng in kept:
+        assert (opacity == copy).all() and (now["opacity"] == copy).all()
+        with pytest.raises(RuntimeError, match="the event of this plan is over"):
+            plan_object.prune([0])
+        assert rng.uniform(3).shape == (3,)
+
+
+def test_random_numbers_depend_on_the_seed_and_the_step(scene: Path, tmp_path: Path) -> None:
+    def draws(folder: str, seed: int) -> list[Any]:
+        drawn: list[Any] = []
+
+        def plan(now: densify.Now, rng: densify.Rng, plan: densify.Plan) -> None:
+            rows, counts = rng.draw(now["opacity"], 50)
+            assert counts.sum() == 50 and rng.normal().shape == (now.rows, 3)
+            chosen = rng.choice(now["opacity"], 5)
+            drawn.append((rng.uniform(4).tolist(), rows.tolist(), chosen.tolist(), rng.generator().random()))
+
+        train(scene, make("draws", plan, every=30), tmp_path / folder, seed=seed)
+        return drawn
+
+    first = draws("a", 1)
+    assert first == draws("b", 1) and first != draws("c", 2) and first[0] != first[1]
+
+
+def test_state_is_saved_and_restored(scene: Path, tmp_path: Path) -> None:
+    def plan(self: Any, now: Any, rng: Any, plan: densify.Plan) -> None:
+        self.count += 1
+        self.log.append(now.step)
+        plan.prune(np.arange(now.rows)[1:2])
+        plan.cause(f"event{self.count}")
+
+    counted = make("counted", plan, count=densify.state(0), log=densify.state([]))
+    whole = train(scene, counted, tmp_path / "whole")
+    train(scene, counted, tmp_path / "parts", iterations=60, checkpoint_every=25)
+    # A second process would not find the class, but this one does.
+    for checkpoint in (tmp_path / "parts" / "checkpoints").glob("iteration_60*"):
+        checkpoint.unlink()
+    resumed = densify.train(output=tmp_path / "parts", scene=scene, policy=counted, resume=True, progress=False)
+    assert [event["cause"] for event in resumed.events] == [f"event{n}" for n in range(1, 7)]
+    model = "point_cloud/iteration_60/point_cloud.ply"
+    assert (resumed.folder / model).read_bytes() == (whole.folder / model).read_bytes()
+    densify.check_policy(counted)
+
+
+def test_state_that_is_not_json_ends_the_run(scene: Path, tmp_path: Path) -> None:
+    for number, value in enumerate([object(), float("nan"), {1: 2}, np.zeros(3), 2**70, b"bytes"]):
+
+        def plan(self: Any, now: Any, rng: Any, plan: Any) -> None:
+            self.count = value
+
+        with pytest.raises(densify.PolicyError, match="state `count`"):
+            train(scene, make("stateful", plan, count=densify.state(0)), tmp_path / str(number))
+
+
+def test_other_attributes_cannot_be_set(scene: Path, tmp_path: Path) -> None:
+    def plan(self: Any, now: Any, rng: Any, plan: Any) -> None:
+        self.memory = 1
+
+    assert isinstance(fails(scene, plan, tmp_path / "run").__cause__, AttributeError)
+
+
+def test_the_pickle_of_another_program_is_no_state() -> None:
+    from densify import _policy
+
+    policy = make("pickled", lambda now, rng, plan: None, count=densify.state(0))()
+    for text in ["null", "[1]", '{"other": 1}', '{"count": "one"}', '{"count": 1, "more": 2}']:
+        with pytest.raises(ValueError):
+            _policy.restore_state(policy, text)
+    _policy.restore_state(policy, '{"count": 7}')
+    assert policy.count == 7 and json.loads(_policy.state_of(policy) or "") == {"count": 7}
+
+
+def test_schedules_and_views(scene: Path, tmp_path: Path) -> None:
+    seen: list[Any] = []
+    aux = densify.Aux(columns=["weight_max", "pixel_count"], map=densify.PixelMap(error=1.0), points=5)
+
+    def observe(self: Any, view: densify.View) -> None:
+        with pytest.raises(KeyError, match="not declared"):
+            view["depth"]
+        seen.append((view.step, len(view.points), view["weight_max"].shape == (view.rows,), view.loss > 0))
+
+    policy = make(
+        "schedules",
+        lambda now, rng, plan: plan.prune([0]),
+        needs={
+            "aux": aux,
+            "cadence": densify.Cadence(all=2),
+            "loss_terms": densify.LossTerms(opacity=0.01),
+            "noise": densify.NoiseTerm(1.0, 100.0, 0.005),
+            "least_resolution": 0.5,
+        },
+        every=30,
+        observe=observe,
+        aux_views=lambda self, step, rows, budget: 2,
+        cadence=lambda self, step: densify.Cadence(all=1 + step % 2),
+        loss_terms=lambda self, step: densify.LossTerms(opacity=0.01 / step),
+        noise=lambda self, step: None if step > 30 else densify.NoiseTerm(1.0, 100.0, 0.005),
+        resolution=lambda self, step: 0.5 if step < 20 else 1.0,
+    )
+    train(scene, policy, tmp_path / "run")
+    assert seen == [(30, 5, True, True)] * 2 + [(60, 5, True, True)] * 2
+    for name, answer, message in [
+        ("cadence", lambda self, step: 3, "densify.Cadence"),
+        ("resolution", lambda self, step: 2.0, "resolution is 2"),
+        ("is_due", lambda self, step: "maybe" if step == 7 else False, "bool"),
+        ("noise", lambda self, step: None if step < 5 else 1 / 0, "division by zero"),
+    ]:
+        policy = make("schedules", lambda now, rng, plan: None, **{name: answer})
+        with pytest.raises(densify.DensifyError, match=message):
+            train(scene, policy, tmp_path / name)
+
+
+def test_a_run_is_the_same_in_another_process(scene: Path, tmp_path: Path) -> None:
+    """The command knows the policies of a file, trains with them, and resumes their runs."""
+    words = [sys.executable, "-m", "densify"]
+    folder = tmp_path / "run"
+    options = ["--iterations", "60", "--budget", "220", "--init", "random", "--init-points", "200", "--quiet"]
+    file = ["--policy", "steady", "--policy-file", str(EXAMPLES / "steady.py")]
+    settings = ["--policy-set", "steady.grow_every=10", "--policy-set", "steady.grow_until=60"]
+    done = subprocess.run(
+        [*words, "train", str(scene), "-o", str(folder), *file, *settings, *options, "--backend", "cpu"],
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    here = train(scene, Steady(grow_every=10, grow_until=60), tmp_path / "here", budget=220)
+    model = "point_cloud/iteration_60/point_cloud.ply"
+    assert (folder / model).read_bytes() == (here.folder / model).read_bytes()
+    longer = [*words, "train", str(scene), "-o", str(folder), "--resume", "--iterations", "70", "--quiet"]
+    done = subprocess.run(longer, capture_output=True, text=True)
+    assert done.returncode == 0 and (folder / "point_cloud" / "iteration_70").is_dir(), done.stderr
+    for wrong, message in [("missing.py", "there is no file"), ("no_such_module", "No module named")]:
+        done = subprocess.run([*words, "train", "x", "--policy-file", wrong], capture_output=True, text=True)
+        assert done.returncode == 2 and message in done.stderr, done.stderr
+
+
+def test_the_plug_in_of_pytest_runs_the_conformance_suite(tmp_path: Path) -> None:
+    def run(*words: str) -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, "-m", "pytest", "-q", str(tmp_path), *words]
+        return subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
+
+    done = run("--densify", str(EXAMPLES / "steady.py"))
+    assert done.returncode == 0 and "1 passed" in done.stdout, done.stdout + done.stderr
+    broken = tmp_path / "broken.py"
+    text = (EXAMPLES / "steady.py").read_text().replace('"steady"', '"broken"')
+    broken.write_text(text.replace("plan.prune(densify.spare_one(faint, now[\"opacity\"]))", "plan.prune(range(now.rows))"))
+    done = run("--densify", str(broken))
+    assert done.returncode == 1 and "leaves at least one row" in done.stdout, done.stdout + done.stderr
+    assert run("--densify", "missing.py").returncode == 4
+
+
+def test_a_file_that_starts_a_run_when_it_is_imported_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "runs.py"
+    file.write_text("import densify\ndensify.train('scene:spheres')\n")
+    with pytest.raises(densify.InputError, match="__main__"):
+        densify.import_policies(str(file))
+
+
+def test_a_resumed_run_notes_that_its_policy_has_changed(
+    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "changing.py"
+    file.write_text((EXAMPLES / "steady.py").read_text().replace('"steady"', '"changing"'))
+    folder = tmp_path / "run"
+    options = {"policy": "changing", "policy_file": [str(file)], "output": folder, **SMALL}
+    densify.train(scene, progress=False, **options)
+    saved = densify.Run(folder).config["resolved"]["policy"]
+    assert f"numpy {np.__version__}, changing.py with SHA-256" in saved
+    file.write_text(file.read_text() + "# changed\n")
+    words = ["train", str(scene), "-o", str(folder), "--resume", "--iterations", "70"]
+    done = subprocess.run([sys.executable, "-m", "densify", *words], capture_output=True, text=True)
+    assert done.returncode == 0 and f"the policy was {saved}, and is now" in done.stdout, done.stdout
+
+
+def test_comparison_of_a_class(scene: Path, tmp_path: Path) -> None:
+    compared = densify.compare(
+        scene,
+        [Steady(grow_every=10), "vanilla"],
+        budget=220,
+        seeds=1,
+        iterations=20,
+        output=tmp_path / "comparison",
+        progress=False,
+        threads=2,
+        backend="cpu",
+    )
+    assert "steady" in compared.summary and compared.page.is_file() and len(compared.runs) == 2
+    local = make("local", lambda now, rng, plan: None)
+    local.__densify_policy__ = type(local.__densify_policy__)("local", None)  # type: ignore[attr-defined]
+    with pytest.raises(densify.InputError, match="not in a file"):
+        densify.compare(scene, [local], budget=220)
+
+
+def test_helpers_sort_as_in_rust() -> None:
+    values = np.array([1.0, np.nan, 3.0, 3.0, -np.inf], dtype=np.float64)
+    assert densify.top_k(values, 3).tolist() == [2, 3, 0]
+    assert densify.largest([0, 1, 4], values, 5).tolist() == [0, 4, 1]
+    assert densify.smallest(np.array([True, False, True, True, True]), values, 2).tolist() == [4, 0]
+    assert densify.mean_over_views([6.0, 1.0], [3.0, 0.0]).tolist() == [2.0, 0.0]
+    assert densify.spare_one([0, 1], np.array([0.2, 0.1], np.float32)).tolist() == [1]
+    assert densify.quantile([1.0, 2.0, np.nan], 0.5) == 1.5 and densify.quantile([], 0.5) is None
+    for call, error in [
+        (lambda: densify.top_k(["a"], 1), TypeError),
+        (lambda: densify.top_k([[1.0]], 1), ValueError),
+        (lambda: densify.top_k([1.0], -1), OverflowError),
+        (lambda: densify.largest([7], [1.0], 1), IndexError),
+        (lambda: densify.mean_over_views([1.0], [1.0, 2.0]), ValueError),
+        (lambda: densify.quantile([1.0], 2.0), ValueError),
+    ]:
+        with pytest.raises(error):
+            call()
