@@ -49,7 +49,7 @@ fn project(@builtin(global_invocation_id) id: vec3<u32>) {
         return;
     }
     if LOWERS_OPACITY {
-        // An overflow is found below.
+        // If a determinant overflows, this may be wrong; the check of g.det further down rejects such rows.
         log2_opacity += log2_rho(g);
         reach = log2_opacity + LOG2_REACH;
         if reach <= 0.0 {
@@ -93,24 +93,24 @@ fn project(@builtin(global_invocation_id) id: vec3<u32>) {
     let y0 = tile_of(v - hh - 0.5, lines);
     let y1 = tile_of(v + hh - 0.5, lines);
     let narrow = x0 == x1 || y0 == y1;
-    var wide = 0u;
-    while ((x1 - x0) >> wide) >= 8u {
-        wide++;
+    var log2_width = 0u;
+    while ((x1 - x0) >> log2_width) >= 8u {
+        log2_width++;
     }
-    var high = 0u;
-    while ((y1 - y0) >> high) >= 4u {
-        high++;
+    var log2_height = 0u;
+    while ((y1 - y0) >> log2_height) >= 4u {
+        log2_height++;
     }
-    // With the scaled conic the ellipse is u² + z² <= reach, u = l1·(dx − shear·dy), z = l3·dy. Its
-    // rightmost point is at dy = peak, its leftmost at dy = −peak.
+    // With the scaled conic the ellipse is (l1·(dx − shear·dy))² + (l3·dy)² <= reach. Its rightmost point is
+    // at dy = peak, its leftmost at dy = −peak.
     let peak = g.cov.y / g.cov.x * half_width;
     var bits = 0u;
-    for (var line = 0u; line <= (y1 - y0) >> high; line++) {
+    for (var line = 0u; line <= (y1 - y0) >> log2_height; line++) {
         var first = x0;
         var last = x1;
         if !narrow {
-            let upper = y0 + (line << high);
-            let lower = min(upper + (1u << high) - 1u, y1);
+            let upper = y0 + (line << log2_height);
+            let lower = min(upper + (1u << log2_height) - 1u, y1);
             let top = max(f32(upper * TILE) + 0.5 - v, -hh);
             let bottom = min(f32(lower * TILE + TILE) - 0.5 - v, hh);
             let right_at = min(max(peak, top), bottom);
@@ -123,10 +123,10 @@ fn project(@builtin(global_invocation_id) id: vec3<u32>) {
             last = min(tile_of(u + right + 1e-4 * abs(right) + SLACK - 0.5, columns), x1);
         }
         if first <= last {
-            let from_bit = (first - x0) >> wide;
-            let to_bit = (last - x0) >> wide;
+            let from_bit = (first - x0) >> log2_width;
+            let to_bit = (last - x0) >> log2_width;
             bits |= ((2u << to_bit) - (1u << from_bit)) << (8u * line);
         }
     }
-    footprints[i] = vec4(x0 | x1 << 16u, y0 | y1 << 16u, bits, wide | high << 16u);
+    footprints[i] = vec4(x0 | x1 << 16u, y0 | y1 << 16u, bits, log2_width | log2_height << 16u);
 }

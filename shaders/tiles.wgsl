@@ -167,7 +167,7 @@ fn scan_sums(@builtin(local_invocation_index) lane: u32) {
     }
 }
 
-// Stores the results that depend on the total; launch.b: number of encoded bands.
+// Stores the results that depend on the total; launch.b: number of bands whose passes were encoded.
 fn conclude(total: u32) {
     switch launch.a {
         case FLAGS: {
@@ -184,8 +184,8 @@ fn conclude(total: u32) {
         case COUNTS_ALL: {
             state.total = total;
             if launch.b == 1u {
-                // Only one band was encoded. If the image needs more, the lists stay empty and no
-                // kernel changes the model.
+                // Passes were encoded for one band only. If the image needs more, the lists stay empty and
+                // no kernel changes the model.
                 let fits = total <= frame.model.z;
                 state.short = select(1u, 0u, fits);
                 state.cuts[0] = 0u;
@@ -237,9 +237,9 @@ struct Run {
 
 // The tiles of block `bit` in a line of tiles that are in the footprint and among the band's tiles
 // low..high; none if first > last. `before` is the line's first tile.
-fn run_of(x0: u32, x1: u32, wide: u32, bit: u32, before: u32, low: u32, high: u32) -> Run {
-    var first = x0 + (bit << wide);
-    var last = min(first + (1u << wide) - 1u, x1);
+fn run_of(x0: u32, x1: u32, log2_width: u32, bit: u32, before: u32, low: u32, high: u32) -> Run {
+    var first = x0 + (bit << log2_width);
+    var last = min(first + (1u << log2_width) - 1u, x1);
     if before + last < low || before + first >= high {
         return Run(1u, 0u);
     }
@@ -344,8 +344,8 @@ fn count_tiles(@builtin(global_invocation_id) id: vec3<u32>) {
     }
 }
 
-// Divides the tiles into bands whose lists fit the cap; launch.b: number of encoded bands. The list of a
-// single tile always fits, since the cap is at least the budget.
+// Divides the tiles into bands whose lists fit the cap; launch.b: number of bands whose passes were
+// encoded. The list of a single tile always fits, since the cap is at least the budget.
 @compute @workgroup_size(1)
 fn cut_bands() {
     let cap = frame.model.z;

@@ -1,11 +1,11 @@
 //! Tests with the meshes of the shared data: valid files render, files that need unsupported extensions are
 //! refused with a message that names them, and each malformed file has the outcome listed in `malformed.tsv`.
 //!
-//! Most files with a validator's report have no scene, so each is read twice: unchanged, and with a buffer of
-//! zeros and a scene of all its meshes (if it has none, of meshes made from its accessors or buffer views). Some
-//! files that the validator rejects load nevertheless: their errors are in metadata that is not read, in
-//! alignments that this reader does not need, or in morph targets without weight. Files that the validator
-//! accepts load, or have no triangle to render.
+//! Most files that come with a report of the glTF validator have no scene. Each file with a report is therefore
+//! read twice: unchanged, and with a buffer of zeros and a scene of all its meshes (if it has none, of meshes made from
+//! its accessors or buffer views). Some files that the validator rejects load nevertheless: their errors are in
+//! metadata that is not read, in alignments that this reader does not need, or in morph targets without weight.
+//! Files that the validator accepts load, or have no triangle to render.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -115,7 +115,7 @@ const LOADS: &str = "it loads";
 const EMPTY: &str = "no triangle to render";
 
 /// The files with an unusual outcome, for each of the two readings. All others load, except that the validator's
-/// files, which have no scene, are empty when read unchanged.
+/// files are [`EMPTY`] when read unchanged, as they have no scene.
 const OUTCOMES: &str = include_str!("malformed.tsv");
 
 /// The rows of [`OUTCOMES`] for one of the two readings, `read`: file and outcome.
@@ -181,7 +181,7 @@ fn check_outcome(
     let row = rows.iter().position(|(row, _)| *row == name);
     let expected = row.map_or(others, |row| rows.swap_remove(row).1);
     let found = found.map_or_else(|error| error.to_string(), |_| LOADS.to_owned());
-    // With a buffer of zeros all corners coincide, so such an error counts as loading.
+    // With a buffer of zeros all corners coincide, so the error that no triangle has an area counts as loading.
     let found = if found.contains("no triangle has an area") { LOADS } else { &found };
     if !found.contains(expected) {
         complaints.push(format!("{name}: {found}, expected: {expected}"));

@@ -33,7 +33,7 @@ pub struct Setup {
     pub shortcuts: Shortcuts,
     /// Signals and candidates to collect.
     pub needs: Needs,
-    /// True if steps and measured views may have exposures.
+    /// True if steps and [observed](crate::Backend::observe) views may have exposures.
     pub exposures: bool,
     /// True if the backend only renders, and so needs no memory for training (native backend).
     pub only_renders: bool,

@@ -1,8 +1,8 @@
 //! A run in three stages: its description as the user gave it (`spec`), the description with every choice made
 //! (`resolved`), and its training (`session`).
 //!
-//! The crate knows no subcommand, prints nothing, and does not modify its process. Its caller provides a [`Host`];
-//! progress goes to an [`Observer`]; errors stay data until they are shown.
+//! The crate knows no subcommand, prints nothing, and changes nothing that the whole process shares, such as signal
+//! handlers. Its caller provides a [`Host`]; progress goes to an [`Observer`]; errors stay data until they are shown.
 //!
 //! Modules from bottom to top, each of which uses only those before it: failure, spec, companion, observer, process,
 //! host, models, coordinate_check, near_plane, position_rates, resolved, finished, session.

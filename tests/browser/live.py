@@ -71,7 +71,7 @@ def check(browser: Browser, url: str, run: Path, folder: Path | None) -> None:
         if kind.startswith("row_"):
             browser.choose("left", f"{kind}:0")
             found = browser.run(PROBE)
-            # Some signals may have no values since the last edit.
+            # A signal that the last edit has reset may have no values yet: its picture has few colours, but is not empty.
             assert found["spread"] > 1, f"{kind} is empty"
             colours[kind] = found["colours"]
     assert max(colours.values()) > 12, f"Gaussians have {colours} colours"

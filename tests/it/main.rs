@@ -3,7 +3,7 @@
 //! Most tests run on every backend of `subject`: the native one with every instruction set, and every GPU adapter.
 //!
 //! - Reference: `central` checks the float64 renderer by central differences; `oracle` compares it and the backends
-//!   with stored float64 renders; `extremes` runs the selftest and lists the tests of every extreme.
+//!   with stored float64 renders; `extremes` runs the selftest, and its head lists the tests of each numerical extreme.
 //! - Backends: `agreement` compares them with the native one; `properties` tests arbitrary scenes; `sameness` and
 //!   `resuming` compare bit by bit; `exposure`, `frozen`, `painted` and `undeclared` test single features; `gpu` tests
 //!   features that only the GPU backend has.

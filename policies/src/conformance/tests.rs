@@ -50,7 +50,7 @@ enum Fault {
     ReadsUndeclaredPoints,
     SavesOnlyPart,
     DeclaresNan,
-    HasUndeclaredCadence,
+    HasInvalidCadence,
     HasNanTermsLate,
     ShrinksImagesTooFar,
     /// Shrinks images, depending on state that it does not save.
@@ -86,7 +86,7 @@ const FAULTS: [(Fault, Option<Check>); 28] = [
     (Fault::ReadsUndeclaredPoints, Some(Check::ReadsOnlyDeclared)),
     (Fault::SavesOnlyPart, Some(Check::RestoresState)),
     (Fault::DeclaresNan, Some(Check::DeclaresValidNumbers)),
-    (Fault::HasUndeclaredCadence, Some(Check::DeclaresValidNumbers)),
+    (Fault::HasInvalidCadence, Some(Check::DeclaresValidNumbers)),
     (Fault::HasNanTermsLate, Some(Check::DeclaresValidNumbers)),
     (Fault::ShrinksImagesTooFar, Some(Check::DeclaresValidNumbers)),
     (Fault::ShrinksImagesUnsaved, Some(Check::RestoresState)),
@@ -165,8 +165,8 @@ impl DensityPolicy for Faulty {
 
     fn cadence(&self, step: u32) -> Cadence {
         let all = if step > 100 { 3 } else { 1 };
-        let sh_rest = if self.has(Fault::HasUndeclaredCadence) && step > 90 { 2 } else { 1 };
-        // An interval of 0 steps is invalid whatever the needs declare.
+        let sh_rest = if self.has(Fault::HasInvalidCadence) && step > 90 { 2 } else { 1 };
+        // An interval of 0 steps is invalid, whatever the needs declare.
         Cadence { all: if sh_rest > 1 { 0 } else { all }, sh_rest }
     }
 

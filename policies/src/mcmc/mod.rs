@@ -59,7 +59,7 @@
 //! | grow_until | 25000 | >= 0 | step | end of relocation and growth (exclusive) |
 //! | grow_every | 100 | >= 0 | steps | interval of relocation and growth; 0: never |
 //! | min_opacity | 0.005 | 0 to 1, both excluded | | Gaussians up to this opacity are dead |
-//! | growth | 0.05 | 0 to 1 | Gaussians | growth per 1/300 of the run |
+//! | growth | 0.05 | 0 to 1 | Gaussians | share of Gaussians added per 1/300 of the run |
 //! | most_shares | 51 | 2 to 51 | Gaussians | largest N in the formulas |
 //! | opacity_term | 0.01 | >= 0 | loss | coefficient of the mean opacity |
 //! | scale_term | 0.01 | >= 0 | loss / camera radius | coefficient of the mean standard deviation |

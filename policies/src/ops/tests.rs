@@ -49,14 +49,14 @@ fn every_corruption_is_found() {
         ("a row too few", |ops| ops.rows_after -= 1),
         ("removed miscounted", |ops| ops.counts.removed += 1),
         ("added miscounted", |ops| ops.counts.added -= 1),
-        ("updated miscounted", |ops| ops.counts.updated = 1),
+        ("updated miscounted", |ops| ops.counts.updated -= 1),
         ("opacity bound of one", |ops| ops.clamp_opacity = Some(1.0)),
         ("opacity bound not a number", |ops| {
             ops.clamp_opacity = Some(f32::NAN);
         }),
         ("parent beyond the model", |ops| ops.families[0].parent = 10),
         ("parent is updated too", |ops| ops.families[0].parent = 7),
-        ("parent not moved", |ops| ops.families[0].parent = 8),
+        ("parent in the tail is not moved", |ops| ops.families[0].parent = 8),
         ("bad offspring", |ops| {
             ops.families[0].shape = Shape::Uniform(-1.0);
         }),
@@ -75,7 +75,7 @@ fn every_corruption_is_found() {
         ("child in a seed's slot", |ops| ops.child_slots[0] = 2),
         ("child beyond the model", |ops| ops.child_slots[0] = 8),
         ("updated row does not exist", |ops| ops.updates[0].0 = 12),
-        ("updated row not moved", |ops| ops.updates[0].0 = 8),
+        ("updated row in the tail is not moved", |ops| ops.updates[0].0 = 8),
         ("bad update", |ops| {
             ops.updates[0].1.opacity = OpacityRule::Set(0.0);
         }),

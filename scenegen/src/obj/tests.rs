@@ -23,7 +23,7 @@ fn loaded(obj: &str, files: &[(&str, &[u8])]) -> Result<Model, Error> {
     load(&path)
 }
 
-/// Two squares that meet at a right angle, along the y axis.
+/// The vertices of two squares that meet at a right angle along the y axis.
 const ROOF: &str = "v 0 0 0\nv 0 1 0\nv 1 0 0\nv 1 1 0\nv 0 0 -1\nv 0 1 -1\n";
 
 #[test]
@@ -172,7 +172,7 @@ fn vertex_colours_are_srgb_from_0_to_255_or_0_to_1() {
     }
     let error = loaded("v 0 0 0 1 1 256\n", &[]).expect_err("no colour").to_string();
     assert!(error.contains("line 1") && error.contains("256"), "{error}");
-    // Without colours, the grey stays.
+    // Without vertex colours, the material keeps the default grey or its `Kd`.
     assert_eq!(painted("", "").materials[0].base.x, GREY);
     assert_eq!(painted("", "newmtl m\nKd 0 0 0\n").materials[0].base.x, 0.0);
 }

@@ -29,7 +29,9 @@ pub(super) fn read<const N: usize>(
         channel.sample_type == SampleType::F32 && channel.sampling == exr::math::Vec2(1, 1)
     });
     if header.deep || !plain || found.len() != N {
-        let problem = format!("it is not {N} flat channels of 32-bit floats");
+        let problem = format!(
+            "it must have exactly {N} channels of 32-bit floats, without subsampling or deep data"
+        );
         return Err(bad("header", problem));
     }
     let size = (width as usize, height as usize);

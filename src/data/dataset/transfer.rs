@@ -26,8 +26,8 @@ enum Transfer {
     HighRange(&'static str),
 }
 
-/// The exponent to which a PNG's values raise linear light; `None` if the values are, or may be, sRGB, or if they have
-/// a high dynamic range.
+/// The exponent of a PNG's transfer function: its values are linear light to this power. `None` if the values are, or
+/// may be, sRGB, or if they have a high dynamic range.
 pub(super) fn exponent(input: impl BufRead + Seek) -> Option<f64> {
     match stated_transfer(input)? {
         Transfer::Exponent(exponent) => Some(exponent),
@@ -74,8 +74,8 @@ fn stated_transfer(mut input: impl BufRead + Seek) -> Option<Transfer> {
         }
         input.seek_relative(rest).ok()?;
     }
-    let is_other = |exponent: &f64| *exponent > 0.0 && (exponent / SRGB - 1.0).abs() > TOLERANCE;
-    gamma.filter(|exponent| !ignores_gamma && is_other(exponent)).map(Transfer::Exponent)
+    let is_not_srgb = |exponent: &f64| *exponent > 0.0 && (exponent / SRGB - 1.0).abs() > TOLERANCE;
+    gamma.filter(|exponent| !ignores_gamma && is_not_srgb(exponent)).map(Transfer::Exponent)
 }
 
 /// Converts values that are linear light to the power of `exponent` to sRGB.

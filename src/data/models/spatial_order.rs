@@ -18,7 +18,7 @@ pub(super) fn middle_and_spread(mut values: Vec<f64>) -> (f64, f64) {
     }
     let centre = *values.select_nth_unstable_by(middle, f64::total_cmp).1;
     values.iter_mut().for_each(|value| *value = (*value - centre).abs());
-    // The median is 0 if half of all values are equal.
+    // The median distance is 0 if most values are equal.
     (centre, values.select_nth_unstable_by(middle, f64::total_cmp).1.max(f64::MIN_POSITIVE))
 }
 

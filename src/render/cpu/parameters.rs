@@ -1,8 +1,8 @@
 //! The model's parameters in blocks: all as f32, or all but the means in 16 bits.
 //!
 //! In 16 bits, colour is f16. Log-scales, quaternions and opacity logits, which the optimiser keeps
-//! within bounds, are in fixed point: around −5 the spacing of f16 is 0.004, four times a typical
-//! step of a log-scale.
+//! within bounds, are in fixed point, because f16 would be too coarse: around −5 its spacing is 0.004,
+//! four times a typical step of a log-scale.
 //!
 //! Kernels read and write planes of f32. They access f32 blocks directly; the planes of other blocks are
 //! converted to scratch memory ([`open`](ParameterTask::open)) and stored from there with stochastic
@@ -25,7 +25,7 @@ const MEANS: usize = plane::LOG_SCALE;
 const BOUNDED: usize = plane::SH - plane::LOG_SCALE;
 
 /// Fractional bits of a bounded plane: 14 for quaternions within ±2, 11 for the others within ±16.
-const fn digits(bounded: usize) -> u32 {
+const fn fractional_bits(bounded: usize) -> u32 {
     match bounded + MEANS {
         plane::QUAT..plane::OPACITY => 14,
         _ => 11,
@@ -93,7 +93,7 @@ impl Parameters {
             _ if self.is_wide(plane) => self.wide.get(row, plane),
             None => {
                 let bounded = plane - MEANS;
-                fixed::to_f32(self.fixed.get(row, bounded), digits(bounded))
+                fixed::to_f32(self.fixed.get(row, bounded), fractional_bits(bounded))
             }
             Some(colour) => self.half.get(row, colour).to_f32(),
         }
@@ -104,7 +104,7 @@ impl Parameters {
             _ if self.is_wide(plane) => self.wide.set(row, plane, value),
             None => {
                 let bounded = plane - MEANS;
-                self.fixed.set(row, bounded, fixed::nearest(value, digits(bounded)));
+                self.fixed.set(row, bounded, fixed::nearest(value, fractional_bits(bounded)));
             }
             Some(colour) => self.half.set(row, colour, F16::nearest(value)),
         }
@@ -271,7 +271,7 @@ impl ParameterTask<'_> {
         self.wide.block(block).copy_from_slice(means);
         let to = self.fixed.block(block).as_chunks_mut().0;
         for (i, (from, to)) in bounded.as_chunks().0.iter().zip(to).enumerate() {
-            narrow_fixed(from, to, digits(i), draws);
+            narrow_fixed(from, to, fractional_bits(i), draws);
         }
         narrow(colour, &mut self.half.block(block)[..colour.len()], draws);
     }
@@ -285,7 +285,7 @@ fn to_scratch(wide: &[f32], narrow: (&[i16], &[F16]), planes: usize, scratch: &m
     means.copy_from_slice(wide);
     let (fixed, half) = narrow;
     for (i, (from, to)) in fixed.as_chunks().0.iter().zip(bounded.as_chunks_mut().0).enumerate() {
-        widen_fixed(from, to, digits(i));
+        widen_fixed(from, to, fractional_bits(i));
     }
     widen(&half[..colour.len()], colour);
 }

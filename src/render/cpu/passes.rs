@@ -220,7 +220,8 @@ impl CpuBackend {
         });
     }
 
-    /// Reallocates the sums if they were lent or are too small for these records.
+    /// Reallocates the sums if a reader of signals has not given their memory back, or if they are too small for these
+    /// records.
     pub(super) fn reserve_sums(&mut self, layout: RecordLayout) {
         let needed = self.visible.len() * WIDTH * layout.stride();
         if self.sums.len() < needed {

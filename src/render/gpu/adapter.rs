@@ -62,8 +62,8 @@ impl AdapterSummary {
     }
 }
 
-/// False if there is certainly no GPU: on Linux, if the kernel shows no device. Loading drivers, even
-/// software drivers, takes time, and memory that is never freed.
+/// False only if there is certainly no GPU: on Linux, if no device file of a GPU exists. Checked first because loading
+/// drivers, even software drivers, takes time, and memory that is never freed.
 pub fn may_be_present() -> bool {
     const NODES: [&str; 6] =
         ["/dev/dri", "/dev/nvidiactl", "/dev/dxg", "/dev/kgsl-3d0", "/dev/mali0", "/dev/kfd"];

@@ -1,5 +1,5 @@
-//! A photograph's exposure on the device: uploads the colour transform before a view's passes, and converts the sums
-//! that a step returns to derivatives.
+//! A photograph's exposure on the device: uploads the colour transform before a view's passes, and turns the sums that
+//! a step returns into derivatives.
 
 use super::GpuBackend;
 use super::frame::{Frame, target};
@@ -23,6 +23,7 @@ impl GpuBackend {
         let Some(exposure) = exposure else { return };
         assert!(self.sizes.exposures, "the backend was not made for exposures");
         let [r, g, b, _] = frame.background;
+        // The view is rendered over the colour that the transform turns into the background.
         let [x, y, z] = exposure.behind([r, g, b]);
         let [red, green, blue] = exposure.rows();
         self.write("exposure", bytemuck::cast_slice(&[red, green, blue, [r, g, b, 0.0]]));

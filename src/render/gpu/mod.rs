@@ -280,10 +280,10 @@ impl Backend for GpuBackend {
                     planes.map(|plane| self.column(plane, 0..self.rows)).collect();
                 let max =
                     |a: Vec<f32>, b: Vec<f32>| a.iter().zip(&b).map(|(a, b)| a.max(*b)).collect();
-                let mut kept =
+                let mut largest =
                     columns?.into_iter().reduce(max).unwrap_or_else(|| vec![0.0; self.rows]);
-                kept.iter_mut().for_each(|value| *value = value_of(signal, *value));
-                kept
+                largest.iter_mut().for_each(|value| *value = value_of(signal, *value));
+                largest
             };
             if let Some(column) = signals.get_mut(signal) {
                 column.copy_from_slice(&values);

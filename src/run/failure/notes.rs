@@ -11,7 +11,7 @@ use densify_data::dataset::Note;
 use densify_data::models::{Coarseness, offset_text};
 use densify_render::{Accumulation, AdapterKind, BackendKind, Device};
 
-/// The option `antialias` with a value, which a flag takes only after `=`.
+/// The option `antialias` with a value; on the command line, the value must follow `=`.
 pub(crate) fn antialias_option(spelling: Spelling, kernel: Antialiasing) -> String {
     match spelling {
         Spelling::Terminal => format!("{}={kernel}", spelling.option("antialias")),
@@ -59,7 +59,7 @@ pub(crate) fn dataset(s: Spelling, note: &Note) -> String {
             )
         }
         Note::Cropped { percent, photographs } => format!(
-            "note: up to {percent:.0} % of {photographs} photographs is cropped by undistortion ({} keeps the whole \
+            "note: undistortion crops up to {percent:.0} % of each of {photographs} photographs ({} keeps the whole \
              field of view)",
             s.switch("keep_fov")
         ),

@@ -1,4 +1,4 @@
-//! The memory of runs that are prepared elsewhere, such as those of a batch.
+//! The memory of runs that are only planned here and trained later, such as those of a batch.
 
 use super::{ModelSize, ResolvedRun};
 use crate::failure::Failure;

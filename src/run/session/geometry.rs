@@ -18,7 +18,7 @@ use densify_train::output::{geometry_of, model_path, write_geometry};
 /// # Errors
 /// When the files of the surface are damaged, or as [`Opened::geometry`].
 pub(super) fn measure(session: Session<'_>, folder: &Path) -> Result<(), Failure> {
-    // The rest of the session keeps the folder locked.
+    // The fields that stay in `session`, among them `guard`, keep the folder locked until this function returns.
     let (run, observer) = (session.run, session.observer);
     let Some(measurement) = run.geometry_measurement else { return Ok(()) };
     let iteration = run.trainer.steps_done();

@@ -219,16 +219,16 @@ impl<'a> Planner<'a> {
 
     /// Plans a given number of blocks.
     fn plan_grid(&self, grid: [usize; 2], staging: &Path) -> Result<BlockPlan, Failure> {
-        let work = self.visibility.work();
-        let total: f64 = work.iter().sum();
+        let point_work = self.visibility.work();
+        let total: f64 = point_work.iter().sum();
         let widths = self.visibility.widths();
         let margin = [0, 1].map(|axis| self.options.margin * widths[axis] / grid[axis] as f64);
         let points = &self.visibility.on_ground;
-        let mut block = Vec::new();
-        for (index, cell) in divide(points, &work, grid).into_iter().enumerate() {
+        let mut blocks = Vec::new();
+        for (index, cell) in divide(points, &point_work, grid).into_iter().enumerate() {
             let name = format!("block-{}-{}", index / grid[1], index % grid[1]);
             let share = |cell: &Cell| {
-                let inside = points.iter().zip(&work).filter(|(at, _)| cell.contains(**at));
+                let inside = points.iter().zip(&point_work).filter(|(at, _)| cell.contains(**at));
                 inside.map(|(_, work)| work).sum::<f64>() / total.max(f64::MIN_POSITIVE)
             };
             let rows_for = |share: f64| (self.rows as f64 * share) as usize;
@@ -253,10 +253,10 @@ impl<'a> Planner<'a> {
             let iterations = ((whole * share_of_views).round() as u32).max(1);
             let memory = self.memory_of_block(&name, budget, iterations, &folder)?;
             let views = train;
-            block.push(Block { name, rows, budget, views, iterations, memory, work, cell });
+            blocks.push(Block { name, rows, budget, views, iterations, memory, work, cell });
         }
         let coarse = self.coarse()?;
-        let largest = block.iter().map(|block| block.budget).max().unwrap_or(0) + self.coarse_rows;
+        let largest = blocks.iter().map(|block| block.budget).max().unwrap_or(0) + self.coarse_rows;
         Ok(BlockPlan {
             densify: env!("CARGO_PKG_VERSION").to_owned(),
             scene: self.scene.clone(),
@@ -267,7 +267,7 @@ impl<'a> Planner<'a> {
             merge_memory: super::merge::memory(largest, self.sh_degree),
             ground: self.ground,
             coarse,
-            block,
+            block: blocks,
         })
     }
 
@@ -335,7 +335,8 @@ impl<'a> Planner<'a> {
         Ok(Coarse { rows: self.coarse_rows, iterations: spec.schedule.iterations.0, memory })
     }
 
-    /// Upper bound of a run's memory; fails if it exceeds the limit.
+    /// Upper bound of a run's memory; fails if it exceeds the limit. `models` are the sizes of the models of `--init`
+    /// and `--freeze`.
     fn memory_of_run(
         &self,
         name: &str,

@@ -66,11 +66,12 @@ type Moments = [f64; 4];
 /// SSIM of rows `first..last`. Shape: `[last − first, width, 3]`.
 fn block_map(pair: &Pair<'_>, window: &[f64], first: usize, last: usize) -> Vec<f64> {
     let values = 3 * pair.width;
-    let above = first.saturating_sub(RADIUS);
-    let below = (last + RADIUS).min(pair.height);
-    let mut across: Vec<Moments> = Vec::with_capacity((below - above) * values);
+    // The block's rows and those that their windows reach.
+    let top = first.saturating_sub(RADIUS);
+    let bottom = (last + RADIUS).min(pair.height);
+    let mut across: Vec<Moments> = Vec::with_capacity((bottom - top) * values);
     let mut row = Vec::with_capacity(values);
-    for y in above..below {
+    for y in top..bottom {
         moments_of_row(pair, y, &mut row);
         for i in 0..values {
             let (x, c) = (i / 3, i % 3);
@@ -91,7 +92,7 @@ fn block_map(pair: &Pair<'_>, window: &[f64], first: usize, last: usize) -> Vec<
         for i in 0..values {
             let mut sum = Moments::default();
             for row in from..to {
-                add(&mut sum, window[row + RADIUS - y], &across[(row - above) * values + i]);
+                add(&mut sum, window[row + RADIUS - y], &across[(row - top) * values + i]);
             }
             map.push(similarity(sum));
         }
@@ -111,7 +112,7 @@ fn moments_of_row(pair: &Pair<'_>, y: usize, row: &mut Vec<Moments>) {
         let weight = pair.weight(p);
         for c in 0..3 {
             let truth = pair.truth(p, c);
-            // An ignored pixel may be NaN.
+            // The mask's weight scales the pixel's error. An ignored pixel may be NaN.
             let error = if weight > 0.0 { weight * pair.error(p, c) } else { 0.0 };
             let x = truth + error;
             row.push([error, truth, error * error, x * x + truth * truth]);

@@ -14,7 +14,7 @@ use super::{call, count, json, scratch, text};
 const BUDGET: u64 = 800;
 const STEPS: u32 = 1000;
 /// `vanilla` stops growing at the budget, a hard stop. These are the best settings found for it: growth every 20 steps
-/// (the default interval does not shrink below 100), and no opacity resets, from which a short run does not recover.
+/// (the default is 100 even in short runs), and no opacity resets, from which a short run does not recover.
 const HARD_STOP: &str = "--policy-set vanilla.grow_every=20 --policy-set vanilla.reset_every=0";
 
 /// A built-in scene written to a temporary folder.

@@ -191,7 +191,7 @@ fn a_model_beyond_the_budget_keeps_its_visible_gaussians() {
     let outcome = train(scene.path(), &cut, 1, &flags).ok();
     let message = format!("{visible_rows} Gaussians beyond the budget left out");
     assert!(outcome.stdout.contains(&message), "{outcome:?}");
-    // One step changes little, so the kept Gaussians must be opaque.
+    // One step changes opacities little, so they still show which Gaussians were kept.
     let visible = |logit: &&f32| **logit > -8.0;
     let kept = gaussians(&model_path(&cut, 1));
     assert_eq!(kept.opacity_logits.iter().filter(visible).count(), visible_rows);
@@ -224,7 +224,7 @@ fn unsuitable_models_are_refused_or_reported() {
     std::fs::write(&cut, &read(&file)[..2_000]).unwrap();
     assert_refused(&start(&cut, ""), root.path(), &["--init", "cut.ply"]);
 
-    // Models in coordinates other than the dataset's: this one is outside all views.
+    // Models in coordinates other than the dataset's.
     let moved = |name: &str, map: fn([f32; 3]) -> [f32; 3]| {
         let mut model = gaussians(&file);
         for mean in &mut model.means {
@@ -234,6 +234,7 @@ fn unsuitable_models_are_refused_or_reported() {
         write_ply(&model, &path);
         path
     };
+    // This model is outside all views.
     let above = moved("above.ply", |[x, y, z]| [x, y + 1e4, z]);
     assert_refused(&start(&above, ""), root.path(), &["above.ply", "0 of its", "coordinates"]);
     assert!(!files(root.path()).keys().any(|name| name.starts_with("no/")));

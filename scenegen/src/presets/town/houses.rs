@@ -141,6 +141,7 @@ impl Town {
             let times = [along.length() / 3.0, up.length() / 3.0];
             self.slab(corner, [along, up, ROOF / slope.cos() * DVec3::Y], times, tiles);
         }
+        // The chimney.
         let (aside, front) = (between(draws, -0.6, 0.6) * w, 0.35 * d);
         let (bottom, top) = (eaves + 0.5 * rise, eaves + rise + between(draws, 0.5, 1.1));
         let middle = place.at(aside, 0.5 * (bottom + top), front);

@@ -1,8 +1,8 @@
-//! Names of the extension and of its attributes.
+//! Names in glTF's extension for Gaussian splats, and constants of the files that use it.
 
 /// First bytes of a binary file.
 pub(super) const MAGIC: &[u8; 4] = b"glTF";
-/// The extension.
+/// Name of the extension.
 pub(super) const SPLATS: &str = "KHR_gaussian_splatting";
 /// Logarithms of the scales, in an attribute of densify's own: they cannot be recovered bit for bit from the scales
 /// that the standard stores.

@@ -8,8 +8,8 @@ use super::accessors::{Accessor, Buffers, View};
 use super::layout::{SPLATS, coefficient};
 use crate::models::read_model;
 
-/// A normalised minimum is −1, like the value above it (glTF 2.0, section 3.11); without normalisation it keeps its
-/// value.
+/// If normalised, the smallest integer is −1, as is the next larger one (glTF 2.0, section 3.11); otherwise it keeps
+/// its value.
 #[test]
 fn signed_integers_keep_their_minimum_unless_normalised() {
     let bytes = [-128i8, -127, 127].map(|v| v as u8).to_vec();

@@ -26,18 +26,18 @@ fn sog_folder() -> tempfile::TempDir {
     folder
 }
 
-/// Largest differences of position, logarithm of scale, opacity, colour in band 0 and in band 1, and angle of two
-/// models whose rows are the same in another order.
+/// Largest differences between two models with the same rows, in any order: of position, logarithm of scale, opacity,
+/// colour in band 0, colour in band 1, and angle.
 fn differences(a: &Gaussians, b: &Gaussians) -> [f32; 6] {
     assert_eq!((a.len(), a.sh_degree), (b.len(), b.sh_degree));
     let mut largest = [0f32; 6];
     let mut used = vec![false; b.len()];
     for row in 0..a.len() {
-        let far = |other: &usize| {
-            let apart = |i: usize| (a.means[row][i] - b.means[*other][i]).powi(2);
-            (0..3).map(apart).sum::<f32>().sqrt()
+        let distance = |other: &usize| {
+            let squared = |i: usize| (a.means[row][i] - b.means[*other][i]).powi(2);
+            (0..3).map(squared).sum::<f32>().sqrt()
         };
-        let nearest = (0..b.len()).min_by(|x, y| far(x).total_cmp(&far(y))).unwrap();
+        let nearest = (0..b.len()).min_by(|x, y| distance(x).total_cmp(&distance(y))).unwrap();
         assert!(!std::mem::replace(&mut used[nearest], true), "row {row} is there twice");
         let gap =
             |x: &[f32], y: &[f32]| x.iter().zip(y).map(|(x, y)| (x - y).abs()).fold(0.0, f32::max);
@@ -45,7 +45,7 @@ fn differences(a: &Gaussians, b: &Gaussians) -> [f32; 6] {
         let norm = |q: [f32; 4]| q.iter().map(|v| v * v).sum::<f32>().sqrt();
         let cosine = p.iter().zip(q).map(|(p, q)| p * q).sum::<f32>() / norm(p) / norm(q);
         let found = [
-            far(&nearest),
+            distance(&nearest),
             gap(&a.log_scales[row], &b.log_scales[nearest]),
             (sigmoid(a.opacity_logits[row]) - sigmoid(b.opacity_logits[nearest])).abs(),
             gap(&a.sh_of(row)[..3], &b.sh_of(nearest)[..3]),
@@ -67,8 +67,8 @@ fn every_format_holds_the_same_model() {
     for (path, limits) in [
         // Positions in 11 bits (y: 10) of a range of 4; colours in eight bits of a range of 3; bands from −4 to 4.
         (corpus("compressed-ply/twelve.ply"), [0.003, 0.002, 0.002, 0.006, 0.016, 0.003]),
-        // Positions with 12 fractional bits; log-scales in sixteenths; colours in steps of 1/(255·0.15); bands in eight
-        // bits, then five, of a range of 2; quaternions in nine bits.
+        // Positions with 12 fractional bits; log-scales in sixteenths; colours in steps of 1/(255·0.15); bands rounded
+        // to eight bits, then to five, of a range of 2; quaternions in nine bits.
         (corpus("spz/v3.spz"), [0.000_25, 0.032, 0.002, 0.014, 0.036, 0.004]),
         (corpus("spz/v4.spz"), [0.000_25, 0.032, 0.002, 0.014, 0.036, 0.004]),
         // Positions in 16 bits of logarithms; scales and colours in codebooks; bands in a palette, where two rows may
@@ -133,7 +133,8 @@ fn a_byte_order_mark_is_skipped() {
 fn nodes_place_their_splats() {
     let placed = read(&corpus("gltf/placed.gltf"));
     let plain = read(&corpus("glb/twelve.glb"));
-    // A mean is moved into glTF's frame, where (x, y, z) becomes (z, x, y), is doubled and shifted, and then back.
+    // A mean is converted to glTF's frame, where (x, y, z) is turned to (z, x, y), doubled and shifted; the result is
+    // converted back.
     let expected = |[x, y, z]: [f32; 3]| {
         let [x, y, z] = [-x, -y, z];
         let [x, y, z] = [2.0 * z + 1.0, 2.0 * x + 2.0, 2.0 * y + 3.0];
@@ -193,7 +194,7 @@ fn dishonest_files_are_refused_with_the_reason() {
         change(&mut bytes);
         bytes
     };
-    // A header that is not compressed can be changed in place.
+    // The header of SPZ version 4 is not compressed, so it can be changed in place.
     let spz = |at: usize, to: u8| changed("spz/v4.spz", &|bytes| bytes[at] = to);
     let text = |format: &str, from: &str, to: &str| {
         let bytes = std::fs::read(corpus(format)).unwrap();
@@ -352,7 +353,7 @@ fn shared_models_of_other_programs_load() {
     assert!(message.to_string().contains("splat-transform"), "{message}");
 }
 
-/// The current form of the statement of antialiasing, and the earlier one; neither states a kernel.
+/// SOG states antialiasing in `model`, formerly in `antialias`; neither states the size of the kernel.
 #[test]
 fn both_antialiasing_statements_of_sog_are_read() {
     let folder = sog_folder();

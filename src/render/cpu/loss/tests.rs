@@ -48,14 +48,14 @@ fn run_in(
 #[test]
 fn the_mean_of_the_pixel_errors_is_the_loss() {
     for mask in [false, true] {
-        let (full, gradient, _) = run(ErrorRequests::default(), mask);
+        let (expected, gradient, _) = run(ErrorRequests::default(), mask);
         assert!(gradient.iter().any(|g| *g != 0.0));
         for for_candidates in [None, Some([1.0, 1.0])] {
             let for_rows = Some(ErrorScore::default());
-            let (value, same, parts) = run(ErrorRequests { for_candidates, for_rows }, mask);
-            assert_eq!((value, &same), (full, &gradient));
-            let mean = parts.into_iter().map(f64::from).sum::<f64>() / (37.0 * 50.0);
-            assert!((mean - full.loss()).abs() < 1e-6, "{mean} {full:?}");
+            let (value, unchanged, errors) = run(ErrorRequests { for_candidates, for_rows }, mask);
+            assert_eq!((value, &unchanged), (expected, &gradient));
+            let mean = errors.into_iter().map(f64::from).sum::<f64>() / (37.0 * 50.0);
+            assert!((mean - expected.loss()).abs() < 1e-6, "{mean} {expected:?}");
         }
     }
 }

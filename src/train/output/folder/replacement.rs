@@ -1,4 +1,4 @@
-//! Replaces one run by another by renaming files within the folder, so that an interruption at any time can be
+//! Replaces one run by another by renaming files within the folder. A replacement interrupted at any time can be
 //! completed or undone.
 
 use std::fs;

@@ -57,7 +57,7 @@ fn replacing_affects_only_files_of_runs_and_only_at_the_end() {
 #[test]
 fn a_failed_replacement_leaves_the_old_run_unchanged() {
     let root = tempfile::tempdir().unwrap();
-    // A file of the old run cannot be moved away; a file of the new run cannot be moved in.
+    // First, a file of the old run cannot be moved away; then, a file of the new run cannot be moved in.
     for file in ["config.toml", "results.json"] {
         for name in ["config.toml", "cameras.json", "stats/old.jsonl"] {
             write(&root.path().join(name), "old");
@@ -87,8 +87,8 @@ fn a_failed_replacement_leaves_the_old_run_unchanged() {
 /// files.
 #[test]
 fn a_stuck_replacement_is_reported_and_recovered() {
-    // The operation that fails, the file, the number of successes before, the prefix of the old run's folder, and the
-    // valid run.
+    // The operation that fails, the file, the number of times that it succeeds before, the prefix of the folder set
+    // aside for the old run, and the run that is in place after recovery.
     for (operation, file, spared, aside, valid) in [
         (Operation::Create, "", 0, None, "old"),
         (Operation::Rename, "", 1, Some(OLD), "old"),
@@ -135,7 +135,7 @@ fn a_resumed_run_has_no_incomplete_files() {
     assert_eq!(entries(&root.path().join("stats")), ["train.jsonl"]);
     assert_eq!(entries(&root.path().join("point_cloud/iteration_1")), ["point_cloud.ply"]);
     assert_eq!(RunFolder::staged(root.path()), [root.path().join(".densify-new-x")]);
-    // A restart would remove a model.
+    // A restart is refused while it would remove a model.
     assert!(RunFolder::resume(root.path(), true).unwrap_err().to_string().contains("another run"));
     fs::remove_dir_all(root.path().join("point_cloud")).unwrap();
     drop(RunFolder::resume(root.path(), true).unwrap());
