@@ -176,7 +176,7 @@ impl Observer for Follower {
     fn interrupt(&self) -> Option<Interrupt> {
         if self.error.borrow().is_none()
             && is_time(&self.looked)
-            && let Err(error) = Python::attach(|py| py.check_signals())
+            && let Err(error) = Python::attach(Python::check_signals)
         {
             *self.error.borrow_mut() = Some(error);
         }
