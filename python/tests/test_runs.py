@@ -163,7 +163,7 @@ def test_a_trainer_is_stepped(scene: Path, tmp_path: Path) -> None:
 
 
 def test_a_trainer_that_has_failed_does_not_continue(scene: Path) -> None:
-    from .test_policies import make
+    from .made import make
 
     policy = make("fails_at_once", lambda now, rng, plan: 1 / 0)
     trainer = densify.prepare(scene, policy=policy, **SMALL)
@@ -176,7 +176,7 @@ def test_a_trainer_that_has_failed_does_not_continue(scene: Path) -> None:
 
 
 def test_a_trainer_in_use_by_another_thread(scene: Path) -> None:
-    from .test_policies import make
+    from .made import make
 
     seen: list[str] = []
 
