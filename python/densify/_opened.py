@@ -88,9 +88,7 @@ def evaluate(
         )
     views, mean, geometry = json.loads(text)
     names = ("PSNR", "SSIM", "FLIP", "LPIPS")
-    by_view = {
-        name: {key: value for key, value in zip(names, values) if value is not None} for name, *values in views
-    }
+    by_view = {name: {key: value for key, value in zip(names, values) if value is not None} for name, *values in views}
     return Scores(mean, by_view, geometry)
 
 
@@ -128,8 +126,6 @@ def export(
 ) -> Path:
     """Writes a model in another format: ply, spz, sog, glb, … as ``densify export`` does."""
     listener = Listener(progress)
-    core = _densify.ModelArrays.load(
-        fspath(model), iteration=iteration, antialias=antialias, listener=listener
-    )
+    core = _densify.ModelArrays.load(fspath(model), iteration=iteration, antialias=antialias, listener=listener)
     core.save(fspath(output), format=format, coordinates=coordinates, overwrite=overwrite, listener=listener)
     return Path(output)

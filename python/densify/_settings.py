@@ -18,9 +18,7 @@ RunOrModel: TypeAlias = StrPath
 PolicyLike: TypeAlias = str | object
 
 
-def table_of(
-    scene: Scene | None, policy: PolicyLike | None, output: StrPath | None, options: Mapping[str, Any]
-) -> str:
+def table_of(scene: Scene | None, policy: PolicyLike | None, output: StrPath | None, options: Mapping[str, Any]) -> str:
     """The options of a run as JSON."""
     table = dict(options)
     if scene is not None:

@@ -104,9 +104,7 @@ def scenegen(
 
     Options are those of a scene: rig, train, test, size=(width, height), fov, grid, seed, points={"count": …}, …
     """
-    _densify.scenegen(
-        fspath(source), fspath(output), plain(options), overwrite=overwrite, listener=Listener(progress)
-    )
+    _densify.scenegen(fspath(source), fspath(output), plain(options), overwrite=overwrite, listener=Listener(progress))
     return Path(output)
 
 

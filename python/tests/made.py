@@ -37,9 +37,7 @@ def make(name: str, plan: Any, signals: Any = ("opacity",), **more: Any) -> type
 
 
 def train(scene: Path, policy: Any, folder: Path, **options: Any) -> densify.Run:
-    return densify.train(
-        scene, policy=policy, output=folder, progress=False, **{**SMALL, **options}
-    )
+    return densify.train(scene, policy=policy, output=folder, progress=False, **{**SMALL, **options})
 
 
 def fails(scene: Path, plan: Any, folder: Path, **more: Any) -> densify.PolicyError:

@@ -80,9 +80,7 @@ def test_detailed_edits(scene: Path, tmp_path: Path) -> None:
         rows = np.arange(4)
         assert plan.update(rows, opacity=densify.to([0.1, 0.2, 0.3, 0.4]), scale=densify.to(0.2)).all()
         assert plan.update([4], position=[0.0, 0.1, 0.2], colour=[0.1, 0.2, 0.3], keep_moments=False).all()
-        turned = densify.Offspring(
-            children=[1, 2], scale=densify.by([[1.0, 0.5, 0.25]] * 2), turn=[0.0, 1.0, 0.0, 0.0]
-        )
+        turned = densify.Offspring(children=[1, 2], scale=densify.by([[1.0, 0.5, 0.25]] * 2), turn=[0.0, 1.0, 0.0, 0.0])
         assert plan.grow([6, 7], turned).all()
         assert plan.grow([8], densify.split_long_axis(0.45, 0.6)).all()
         assert plan.append([[0.0, 0.0, 0.0]], [0.5, 0.5, 0.5], [0.1, 0.2, 0.3], 0.5, [1.0, 0.0, 0.0, 0.0]).all()

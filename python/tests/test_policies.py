@@ -21,6 +21,7 @@ sys.path.insert(0, str(EXAMPLES))
 
 from steady import Steady  # noqa: E402
 
+
 @pytest.mark.parametrize(
     "settings",
     [
@@ -298,7 +299,9 @@ def test_the_plug_in_of_pytest_runs_the_conformance_suite(tmp_path: Path) -> Non
     assert done.returncode == 0 and "1 passed" in done.stdout, done.stdout + done.stderr
     broken = tmp_path / "broken.py"
     text = (EXAMPLES / "steady.py").read_text().replace('"steady"', '"broken"')
-    broken.write_text(text.replace("plan.prune(densify.spare_one(faint, now[\"opacity\"]))", "plan.prune(range(now.rows))"))
+    broken.write_text(
+        text.replace('plan.prune(densify.spare_one(faint, now["opacity"]))', "plan.prune(range(now.rows))")
+    )
     done = run("--densify", str(broken))
     assert done.returncode == 1 and "leaves at least one row" in done.stdout, done.stdout + done.stderr
     assert run("--densify", "missing.py").returncode == 4

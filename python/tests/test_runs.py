@@ -118,7 +118,9 @@ def test_ctrl_c_stops_between_two_steps_with_a_checkpoint(scene: Path, tmp_path:
 
     before = signal.getsignal(signal.SIGINT)
     with pytest.raises(densify.Interrupted, match="SIGINT") as raised:
-        densify.train(scene, output=tmp_path / "run", progress=False, on_step=interrupt, **{**SMALL, "iterations": 100_000})
+        densify.train(
+            scene, output=tmp_path / "run", progress=False, on_step=interrupt, **{**SMALL, "iterations": 100_000}
+        )
     assert isinstance(raised.value, KeyboardInterrupt) and signal.getsignal(signal.SIGINT) is before
     assert list((tmp_path / "run" / "checkpoints").glob("iteration_*"))
 
