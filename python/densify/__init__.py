@@ -61,30 +61,11 @@ from ._needs import (
     Start,
 )
 from ._policy import PolicyInfo, check_policy, import_policies, interval, policies, policy, state, step
-from ._run import (
-    Attempt,
-    Buffer,
-    Comparison,
-    Compressed,
-    MemoryPlan,
-    Page,
-    Run,
-    Scores,
-    Step,
-    Trainer,
-    cameras,
-    compare,
-    compress,
-    evaluate,
-    export,
-    plan,
-    prepare,
-    render,
-    scenegen,
-    train,
-    view,
-)
+from ._opened import Scores, cameras, evaluate, export, render
+from ._run import Run
 from ._scenes import Camera, Dataset, Model, Rendering, write_dataset
+from ._tools import Attempt, Comparison, Compressed, Page, compare, compress, scenegen, view
+from ._train import Buffer, MemoryPlan, Step, Trainer, plan, prepare, train
 
 __all__ = [
     "Attempt",

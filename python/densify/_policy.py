@@ -74,9 +74,7 @@ def step(default: int) -> int:
 def state(default: T, *, init: Literal[False] = False) -> T:
     """A part of the policy's state: JSON values, which checkpoints save. It is not a parameter."""
     text = json.dumps(default, allow_nan=False)
-    return cast(
-        T, dataclasses.field(init=init, default_factory=lambda: json.loads(text), metadata={_STATE: True})
-    )
+    return cast(T, dataclasses.field(init=init, default_factory=lambda: json.loads(text), metadata={_STATE: True}))
 
 
 @dataclass_transform(field_specifiers=(interval, step, state))
@@ -225,10 +223,7 @@ def needs_of(policy: Any, scene: _densify.Scene) -> str:
 
 def _as_json(value: Any) -> Any:
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {
-            field.name.rstrip("_"): _as_json(getattr(value, field.name))
-            for field in dataclasses.fields(value)
-        }
+        return {field.name.rstrip("_"): _as_json(getattr(value, field.name)) for field in dataclasses.fields(value)}
     if isinstance(value, str) or value is None:
         return value
     if isinstance(value, (list, tuple, set, frozenset)):
@@ -273,8 +268,7 @@ def _check_state(name: str, value: Any) -> None:
             _check_state(name, item)
     else:
         raise TypeError(
-            f"state `{name}`: {type(value)} cannot be saved; use numbers, str, list and dict"
-            " (an array: array.tolist())"
+            f"state `{name}`: {type(value)} cannot be saved; use numbers, str, list and dict (an array: array.tolist())"
         )
 
 
@@ -349,9 +343,7 @@ def name_and_settings(policy: Any) -> tuple[str, dict[str, Any], str | None]:
         return policy, {}, None
     mark = getattr(policy, MARK, None)
     if not isinstance(mark, _Registered):
-        raise TypeError(
-            f"policy: expected a name, or a class or an instance made with @densify.policy, not {policy!r}"
-        )
+        raise TypeError(f"policy: expected a name, or a class or an instance made with @densify.policy, not {policy!r}")
     given = () if isinstance(policy, type) else policy._given
     return mark.name, {name: getattr(policy, name) for name in given}, mark.file
 

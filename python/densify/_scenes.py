@@ -39,9 +39,7 @@ class Camera:
     camera_from_world: NDArray[np.float64]
 
     @staticmethod
-    def from_matrices(
-        camera_from_world: ArrayLike, intrinsics: ArrayLike, width: int, height: int
-    ) -> Camera:
+    def from_matrices(camera_from_world: ArrayLike, intrinsics: ArrayLike, width: int, height: int) -> Camera:
         """A camera from a 4×4 matrix and a 3×3 matrix K, as gsplat's ``viewmats`` and ``Ks``."""
         k = np.asarray(intrinsics, dtype=np.float64)
         if k.shape != (3, 3):
@@ -264,9 +262,7 @@ def write_dataset(
     for view, (image, camera) in enumerate(zip(pixels, cameras)):
         width, height, (fx, fy, cx, cy), rows = camera._parts()
         if image.shape[:2] != (height, width):
-            raise ValueError(
-                f"image {view} is {image.shape[1]}x{image.shape[0]}, but its camera is {width}x{height}"
-            )
+            raise ValueError(f"image {view} is {image.shape[1]}x{image.shape[0]}, but its camera is {width}x{height}")
         if not np.isfinite(rows).all():
             raise ValueError(f"camera {view} has a value that is not finite")
         # The file has OpenGL axes: y up, looking along −z.

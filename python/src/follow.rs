@@ -137,6 +137,15 @@ fn is_time(last: &Cell<Option<Instant>>) -> bool {
     due
 }
 
+/// Lets Python's handlers of signals run.
+#[expect(
+    clippy::redundant_closure_for_method_calls,
+    reason = "the method alone is not general enough in its lifetime"
+)]
+fn check_signals() -> PyResult<()> {
+    Python::attach(|py| py.check_signals())
+}
+
 impl Observer for Follower {
     fn spelling(&self) -> Spelling {
         Spelling::Keyword
@@ -176,7 +185,7 @@ impl Observer for Follower {
     fn interrupt(&self) -> Option<Interrupt> {
         if self.error.borrow().is_none()
             && is_time(&self.looked)
-            && let Err(error) = Python::attach(|py| py.check_signals())
+            && let Err(error) = check_signals()
         {
             *self.error.borrow_mut() = Some(error);
         }

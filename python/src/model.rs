@@ -63,7 +63,6 @@ pub(crate) fn antialiasing(name: Option<&str>) -> PyResult<Antialiasing> {
 impl Model {
     #[new]
     #[pyo3(signature = (means, log_scales, quats, opacity_logits, sh, *, origin = [0.0; 3], antialias = None))]
-    #[expect(clippy::too_many_arguments, reason = "the arrays of a model")]
     fn new(
         means: &Bound<'_, PyAny>,
         log_scales: &Bound<'_, PyAny>,

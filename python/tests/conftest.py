@@ -46,13 +46,13 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A dataset of six views, two of them held out."""
     folder = tmp_path_factory.mktemp("data") / "scene"
     rng = np.random.default_rng(1)
-    return densify.write_dataset(
-        folder, images(6), cameras(6), points=rng.normal(size=(150, 3)), test=[2, 4]
-    )
+    return densify.write_dataset(folder, images(6), cameras(6), points=rng.normal(size=(150, 3)), test=[2, 4])
 
 
 @pytest.fixture(scope="session")
 def run(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> densify.Run:
     """A finished run."""
     output = tmp_path_factory.mktemp("runs") / "run"
-    return densify.train(scene, output=output, eval=True, progress=False, **{**SMALL, "init": "points", "init_points": None})
+    return densify.train(
+        scene, output=output, eval=True, progress=False, **{**SMALL, "init": "points", "init_points": None}
+    )

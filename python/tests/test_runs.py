@@ -118,7 +118,9 @@ def test_ctrl_c_stops_between_two_steps_with_a_checkpoint(scene: Path, tmp_path:
 
     before = signal.getsignal(signal.SIGINT)
     with pytest.raises(densify.Interrupted, match="SIGINT") as raised:
-        densify.train(scene, output=tmp_path / "run", progress=False, on_step=interrupt, **{**SMALL, "iterations": 100_000})
+        densify.train(
+            scene, output=tmp_path / "run", progress=False, on_step=interrupt, **{**SMALL, "iterations": 100_000}
+        )
     assert isinstance(raised.value, KeyboardInterrupt) and signal.getsignal(signal.SIGINT) is before
     assert list((tmp_path / "run" / "checkpoints").glob("iteration_*"))
 
@@ -163,7 +165,7 @@ def test_a_trainer_is_stepped(scene: Path, tmp_path: Path) -> None:
 
 
 def test_a_trainer_that_has_failed_does_not_continue(scene: Path) -> None:
-    from .test_policies import make
+    from .made import make
 
     policy = make("fails_at_once", lambda now, rng, plan: 1 / 0)
     trainer = densify.prepare(scene, policy=policy, **SMALL)
@@ -176,7 +178,7 @@ def test_a_trainer_that_has_failed_does_not_continue(scene: Path) -> None:
 
 
 def test_a_trainer_in_use_by_another_thread(scene: Path) -> None:
-    from .test_policies import make
+    from .made import make
 
     seen: list[str] = []
 

@@ -242,7 +242,7 @@ impl DensityPolicy for PythonPolicy {
         }
         Python::attach(|py| {
             let asked = self.object.call_method1(py, "aux_views", (step, rows, budget));
-            asked.and_then(|views| views.extract(py).map_err(PyErr::from)).unwrap_or_else(|error| {
+            asked.and_then(|views| views.extract(py)).unwrap_or_else(|error| {
                 self.suspend(failed(py, error));
                 0
             })

@@ -51,7 +51,7 @@ pub(crate) fn register(
     class: Py<PyAny>,
     about: (String, String, String, String),
     place: (String, u32),
-    (identity, provenance): (String, String),
+    origin: (String, String),
     parameters: Vec<Described<'_>>,
 ) -> PyResult<()> {
     let mut steps = Vec::new();
@@ -66,6 +66,7 @@ pub(crate) fn register(
         let range = range_of(&name, &default, &range)?;
         described.push(Parameter { name, default, range });
     }
+    let (identity, provenance) = origin;
     let (name, summary, source, doc) = about;
     let about = (leak(&name), leak(&summary), leak(&source));
     let factory = Box::leak(Box::new(ClassFactory { class, provenance, parameters: described }));

@@ -1,0 +1,196 @@
+"""Training: whole runs, and trainers that are stepped."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from . import _densify, _policy
+from ._errors import Interrupted
+from ._progress import Listener
+from ._run import Run
+from ._scenes import Camera, Dataset, Model, Rendering, StrPath, colour_of
+from ._settings import PolicyLike, Scene, table_of
+from ._signals import noting
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+    from ._options import Options
+
+
+@dataclass(frozen=True)
+class Step:
+    """One iteration: the view that was trained on, its loss and scores, and the edits of the rows."""
+
+    step: int
+    view: int
+    name: str
+    loss: float
+    l1: float
+    ssim: float
+    rows: int
+    events: list[dict[str, Any]]
+
+
+@dataclass(frozen=True)
+class Buffer:
+    """A line of the table of memory."""
+
+    section: str
+    what: str
+    bytes: int
+
+
+@dataclass(frozen=True)
+class MemoryPlan:
+    """The memory of a run: every buffer, the total, and other sizes that fit the same memory."""
+
+    ledger: list[Buffer]
+    total_bytes: int
+    text: str
+    #: Rows that fit ``memory`` at each degree, for each resolution in ``resolutions``.
+    memory: int
+    resolutions: list[int]
+    rows: list[list[int | None]]
+
+    def __str__(self) -> str:
+        return self.text
+
+
+def train(
+    scene: Scene | None = None,
+    *,
+    policy: PolicyLike | None = None,
+    output: StrPath | None = None,
+    resume: bool = False,
+    overwrite: bool = False,
+    progress: bool = True,
+    on_step: Callable[[int, float, int], object] | None = None,
+    on_record: Callable[[dict[str, Any]], object] | None = None,
+    on_edit: Callable[[dict[str, Any]], object] | None = None,
+    on_test: Callable[[int, dict[str, float]], object] | None = None,
+    **options: Unpack[Options],
+) -> Run:
+    """Trains a scene and writes all files of the run, as ``densify train`` does.
+
+    ``policy`` is a name (default: diet), or a class or an instance made with ``@densify.policy``. ``on_step`` gets
+    step, loss and rows; ``on_record`` a record of every tenth step; ``on_edit`` each edit of the rows; ``on_test`` a
+    step and the mean scores of the test views. Ctrl-C ends the run between two steps, with a checkpoint, and raises
+    Interrupted; ``resume=True`` continues it.
+    """
+    _policy.check_not_importing()
+    stop = _densify.Stop()
+    listener = Listener(progress, on_step, on_record, on_edit, on_test)
+    table = table_of(scene, policy, output, options)
+    with noting(stop):
+        folder = _densify.train(table, resume=resume, overwrite=overwrite, listener=listener, stop=stop)
+    return Run(folder, dataset=scene if isinstance(scene, Dataset) else None)
+
+
+def prepare(
+    scene: Scene,
+    *,
+    policy: PolicyLike | None = None,
+    output: StrPath | None = None,
+    progress: bool = False,
+    **options: Unpack[Options],
+) -> Trainer:
+    """Prepares a run to step through; nothing is written."""
+    _policy.check_not_importing()
+    core = _densify.prepare(table_of(scene, policy, output, options), listener=Listener(progress))
+    return Trainer._of(core, scene if isinstance(scene, Dataset) else None)
+
+
+def plan(
+    scene: Scene, *, policy: PolicyLike | None = None, progress: bool = False, **options: Unpack[Options]
+) -> MemoryPlan:
+    """The memory that a run would take, without training, as ``densify plan`` prints it."""
+    table = table_of(scene, policy, None, options)
+    buffers, total, lines, (memory, images, rows) = _densify.plan(table, listener=Listener(progress))
+    ledger = [Buffer(*buffer) for buffer in buffers]
+    return MemoryPlan(ledger, total, "\n".join(lines), memory, [scale for scale, _ in images], rows)
+
+
+class Trainer:
+    """A prepared run. ``for step in trainer`` trains it to its end."""
+
+    _core: _densify.TrainerCore
+    _stop: _densify.Stop
+    _dataset: Dataset | None
+
+    def __init__(self) -> None:
+        raise TypeError("densify.prepare(…) makes trainers")
+
+    @classmethod
+    def _of(cls, core: _densify.TrainerCore, dataset: Dataset | None) -> Trainer:
+        trainer = cls.__new__(cls)
+        trainer._core, trainer._dataset, trainer._stop = core, dataset, _densify.Stop()
+        return trainer
+
+    def step(self) -> Step:
+        """Does one iteration."""
+        step, view, name, loss, l1, ssim, rows, events = self._core.step()
+        return Step(step, view, name, loss, l1, ssim, rows, json.loads(events))
+
+    def __iter__(self) -> Iterator[Step]:
+        with noting(self._stop):
+            while self.steps_done < self.iterations:
+                if self._stop.asked:
+                    raise Interrupted(f"stopped after step {self.steps_done}")
+                yield self.step()
+
+    def stop(self) -> None:
+        """Ends the loop over this trainer before its next step; other threads may call it."""
+        self._stop.ask()
+
+    def finish(self, *, overwrite: bool = False, progress: bool = True) -> Run:
+        """Trains to the end and writes all files of the run, as ``train`` does."""
+        listener = Listener(progress)
+        with noting(self._stop):
+            folder = self._core.finish(overwrite=overwrite, listener=listener, stop=self._stop)
+        return Run(folder, dataset=self._dataset)
+
+    def model(self) -> Model:
+        """The model in the dataset's own coordinates."""
+        return Model._of(self._core.model())
+
+    def render(self, camera: Camera, *, background: str | Sequence[float] = "black") -> Rendering:
+        """Renders a camera in the dataset's own coordinates."""
+        return Rendering(*self._core.render(camera._parts(), colour_of(background)))
+
+    @property
+    def steps_done(self) -> int:
+        """Number of steps done."""
+        return self._core.steps_done
+
+    @property
+    def iterations(self) -> int:
+        """Length of the run in steps."""
+        return self._core.last
+
+    @property
+    def rows(self) -> int:
+        """Current number of Gaussians."""
+        return self._core.rows
+
+    @property
+    def ledger(self) -> list[Buffer]:
+        """The planned memory, buffer by buffer."""
+        return [Buffer(*buffer) for buffer in self._core.ledger]
+
+    @property
+    def total_bytes(self) -> int:
+        """The memory that the run promises not to exceed [bytes]."""
+        return self._core.total_bytes
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """The options with every choice made."""
+        config: dict[str, Any] = json.loads(self._core.config())
+        return config
+
+    def __repr__(self) -> str:
+        return f"<densify.Trainer: step {self.steps_done} of {self.iterations}, {self.rows:,} Gaussians>"
