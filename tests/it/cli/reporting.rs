@@ -108,7 +108,7 @@ fn a_report_shows_the_results_and_is_self_contained() {
         "worst".into(),
         "best".into(),
         "the promise was kept".into(),
-        "<p>None</p>".into(),
+        "<p>None.</p>".into(),
         "sh_degree".into(),
         "min_opacity".into(),
     ];
