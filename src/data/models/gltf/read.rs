@@ -20,9 +20,13 @@ use densify_core::files::max_unpacked_bytes;
 use densify_core::gaussians::{MAX_SH_DEGREE, sh_coefficients, sigmoid};
 
 /// The extension for splats in SPZ.
-const SPZ: &str = "KHR_gaussian_splatting_compression_spz_2";
+pub(super) const SPZ: &str = "KHR_gaussian_splatting_compression_spz_2";
 /// Extensions that a file may require: the extensions of splats, and extensions without effect on splats.
 const KNOWN: [&str; 4] = [SPLATS, SPZ, "KHR_materials_unlit", "KHR_mesh_quantization"];
+
+/// The values that are read of properties of [`SPLATS`]; the names with a dot are those of drafts.
+const READ: [(&str, &[&str]); 2] =
+    [("kernel", &["ellipse"]), ("colorSpace", &["srgb_rec709_display", "BT.709-sRGB", "BT.709"])];
 
 /// Largest accepted opacity: 1 plus rounding errors.
 const MAX_OPACITY: f32 = 1.001;
@@ -188,6 +192,14 @@ fn splats(
     extension: &Value,
 ) -> Result<SplatFile, LoadError> {
     let path = buffers.path;
+    for (key, known) in READ {
+        if let Some(stated) = extension.get(key)
+            && !stated.as_str().is_some_and(|stated| known.contains(&stated))
+        {
+            let problem = format!("{stated} is not supported, only {}", known.join(", "));
+            return Err(LoadError::damaged(path, format!("{SPLATS}: {key}"), problem));
+        }
+    }
     if let Some(view) = extension.pointer(&format!("/extensions/{SPZ}/bufferView")) {
         let view = view.as_u64().and_then(|view| usize::try_from(view).ok());
         let bytes = buffers.view(view.unwrap_or(usize::MAX))?;
@@ -196,15 +208,6 @@ fn splats(
             axes.map(|axes| format!("its SPZ states the axes {axes}, which glTF overrides"));
         file.notes.extend(ignored);
         return Ok(file);
-    }
-    let stated = |key: &str| extension.get(key).and_then(Value::as_str).unwrap_or_default();
-    if !matches!(stated("kernel"), "ellipse" | "") || stated("colorSpace") == "lin_rec709_display" {
-        let problem = format!(
-            "the kernel {:?} with colours in {:?}; only ellipses with sRGB colours are read",
-            stated("kernel"),
-            stated("colorSpace")
-        );
-        return Err(LoadError::damaged(path, SPLATS, problem));
     }
     let attribute = |name: &str, width: usize| match primitive.attributes.get(name) {
         None => Ok(None),

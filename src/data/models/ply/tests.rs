@@ -67,6 +67,24 @@ fn damaged_rows_are_dropped_up_to_one_percent() {
     assert!(message.contains("3 of 200") && message.contains("file.ply"), "{message}");
 }
 
+/// SHARP states the colours in an element of its own, after the splats.
+#[test]
+fn colours_that_are_not_srgb_are_refused() {
+    let with = |value: u8| {
+        let mut bytes = written(PLY, &model(3, 0)).unwrap();
+        let end = bytes.windows(11).position(|part| part == b"end_header\n").unwrap();
+        let element = b"element color_space 1\nproperty uchar color_space\n";
+        bytes.splice(end..end, *element);
+        bytes.push(value);
+        bytes
+    };
+    let (_folder, path) = saved("file.ply", with(0));
+    assert_eq!(read(&path).unwrap().gaussians.len(), 3);
+    let (_folder, path) = saved("file.ply", with(1));
+    let message = read(&path).unwrap_err().to_string();
+    assert!(message.contains("file.ply: color_space: 1 means"), "{message}");
+}
+
 /// An interrupted export leaves rows of zeros.
 #[test]
 fn rows_of_zeros_are_dropped_up_to_one_percent() {
