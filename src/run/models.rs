@@ -126,7 +126,7 @@ pub fn read_model_as(
 ) -> Result<Gaussians, Failure> {
     let mut file = models::read_model(path)?;
     for (number, problem) in [
-        (file.dropped, "left out: a value is not finite"),
+        (file.dropped, "left out: a value is not finite, or all are 0"),
         (file.repaired, "with a zero quaternion, read as unrotated"),
     ] {
         if number > 0 {

@@ -70,7 +70,8 @@ pub enum MaskMode {
 /// Rule for holding out test views.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub enum Split {
-    /// The dataset's own test split, if it has one; otherwise no view.
+    /// The test split in the file of poses, if there is one; otherwise no view. (Lists beside COLMAP models are for
+    /// [`Eval`](Self::Eval), as in the programs that write them.)
     #[default]
     None,
     /// The dataset's own test split, if it has one; otherwise every 8th view by sorted name.

@@ -16,7 +16,7 @@ const ZERO_QUATERNION: f32 = 1e-12;
 pub struct SplatFile {
     /// The Gaussians, in the file's order and coordinates; bit for bit where the format stores f32.
     pub gaussians: Gaussians,
-    /// Number of Gaussians dropped because a value was not finite.
+    /// Number of Gaussians dropped because a value was not finite, or all were 0.
     pub dropped: usize,
     /// Number of Gaussians whose zero quaternion was replaced with the identity.
     pub repaired: usize,
@@ -50,7 +50,8 @@ impl Rows {
         Self { file, total: 0 }
     }
 
-    /// Adds a Gaussian if its values are finite. Infinite values that some programs write on purpose become finite
+    /// Adds a Gaussian if its values are finite. A row of zeros is no Gaussian, but what an interrupted export leaves
+    /// (splat-transform, pull request 288). Infinite values that some programs write on purpose become finite
     /// first: the log-scale of a flat Gaussian, and the opacity logit of a transparent or opaque one.
     pub(super) fn push(&mut self, row: Row<'_>) {
         let SplatFile { gaussians, dropped, repaired, .. } = &mut self.file;
@@ -66,7 +67,9 @@ impl Rows {
         assert_eq!(row.sh.len(), 3 * sh_coefficients(gaussians.sh_degree), "coefficients of a row");
         self.total += 1;
         let others = row.mean.iter().chain(&row.log_scale).chain(&row.quat).chain(row.sh);
-        if !row.opacity_logit.is_finite() || others.into_iter().any(|value| !value.is_finite()) {
+        let mut values = others.chain([&row.opacity_logit]);
+        let is_finite = values.clone().all(|value| value.is_finite());
+        if !is_finite || values.all(|&value| value == 0.0) {
             *dropped += 1;
             return;
         }
@@ -84,8 +87,8 @@ impl Rows {
         let (dropped, total) = (self.file.dropped, self.total);
         if dropped as f64 > MAX_BAD_ROWS * total as f64 {
             return Err(LoadError::Data(format!(
-                "{}: {dropped} of {total} Gaussians have a value that is not finite, more than 1 %; the file is damaged: \
-                 export it again",
+                "{}: {dropped} of {total} Gaussians have a value that is not finite, or only zeros, more than 1 %; the \
+                 file is damaged: export it again",
                 path.display()
             )));
         }

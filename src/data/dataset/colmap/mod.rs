@@ -4,6 +4,7 @@
 
 mod bin;
 mod camera;
+mod split;
 mod txt;
 
 use std::collections::HashMap;
@@ -17,8 +18,11 @@ use super::formats::DatasetFormat;
 use super::lens::Lens;
 use super::paths::{DataPath, Root, relative};
 use super::pose::{checked_pose, checked_quaternion};
+use super::prepare::text_notes;
 use super::tracks::{TrackSampler, Tracks};
-use super::{Frame, LoadError, LoadOptions, LoadRemedy, Note, PointCloud, Scene, transforms};
+use super::{
+    Frame, LoadError, LoadOptions, LoadRemedy, Note, PointCloud, Scene, Split, transforms,
+};
 
 pub(super) const FORMAT: DatasetFormat = DatasetFormat {
     name: "colmap",
@@ -222,6 +226,12 @@ fn read(root: &Root, options: &LoadOptions) -> Result<Option<Scene>, LoadError> 
     if reduced_missing > 0 {
         notes.push(Note::Text(folders.fell_back_note(reduced_missing)));
     }
+    let mut own_split = false;
+    if options.split == Split::Eval {
+        let mut texts = Vec::new();
+        own_split = split::apply(root, (&chosen.root, &chosen.folder), &mut frames, &mut texts)?;
+        notes.extend(text_notes(texts));
+    }
     if !points.is_file() {
         notes.push(Note::Text(format!("{} does not exist: there are no points", points.display())));
     }
@@ -231,6 +241,7 @@ fn read(root: &Root, options: &LoadOptions) -> Result<Option<Scene>, LoadError> 
         points: model.points,
         points_file: Some(points),
         tracks: model.tracks,
+        own_split,
         notes,
         ..Scene::default()
     }))

@@ -166,3 +166,54 @@ fn respell_name(made: &Made) {
     fs::rename(made.file("images/a.png"), made.file("images/\u{e4}.png")).unwrap();
     made.replace("sparse/0/images.txt", "a.png", "a\u{308}.png");
 }
+
+/// Names of the training views and of the test views.
+fn split(made: &Made, split: Split) -> [Vec<String>; 2] {
+    let data = load_with(made, &LoadOptions { split, ..LoadOptions::default() });
+    [&data.train, &data.test].map(|views| names(views).into_iter().map(str::to_owned).collect())
+}
+
+fn assert_split(made: &Made, train: &[&str], test: &[&str]) {
+    assert_eq!(split(made, Split::Eval), [train, test]);
+}
+
+#[test]
+fn lists_of_other_trainers_define_the_split() {
+    let made = Made::colmap_txt();
+    // Without lists, every eighth photograph is held out.
+    assert_split(&made, &["b.png", "c.png"], &["a.png"]);
+    made.write("test_list.txt", "c.png\n");
+    assert_split(&made, &["a.png", "b.png"], &["c.png"]);
+    made.write("train_list.txt", "b.png\n");
+    assert_split(&made, &["b.png"], &["c.png"]);
+    let eval = LoadOptions { split: Split::Eval, ..LoadOptions::default() };
+    assert_noted(&load_with(&made, &eval), "test_list.txt holds out 1 of 3 photographs");
+    assert_noted(&load_with(&made, &eval), "1 of 3 photographs are in neither list");
+    made.remove("test_list.txt");
+    assert_split(&made, &["b.png"], &["a.png", "c.png"]);
+    made.write("test_list.txt", "b.png\n");
+    assert_split(&made, &["b.png"], &["b.png"]);
+    // The list beside the model takes precedence. Extensions may differ, and Windows ends lines with two characters.
+    made.write("sparse/0/test.txt", "a.JPG\r\n\r\nimages\\b\r\n");
+    assert_split(&made, &["c.png"], &["a.png", "b.png"]);
+    assert_noted(&load_with(&made, &eval), "sparse/0/test.txt holds out 2 of 3 photographs");
+    let chosen = LoadOptions { sparse: Some("sparse/0".into()), ..eval.clone() };
+    assert_eq!(load_with(&made, &chosen).test.len(), 2);
+    // Options take precedence over lists; without them, nothing is held out.
+    let every = Split::Every(std::num::NonZeroU32::new(2).unwrap());
+    let [a, b, c] = ["a.png", "b.png", "c.png"].map(str::to_owned);
+    assert_eq!(split(&made, every), [vec![b.clone()], vec![a.clone(), c.clone()]]);
+    assert_eq!(split(&made, Split::None), [vec![a, b, c], vec![]]);
+}
+
+#[test]
+fn lists_that_do_not_fit_are_refused_or_noted() {
+    let eval = LoadOptions { split: Split::Eval, ..LoadOptions::default() };
+    let made = Made::colmap_txt();
+    made.write("sparse/0/test.txt", "b.png\nnone.png\n");
+    assert_noted(&load_with(&made, &eval), "sparse/0/test.txt: 1 of 2 names, first: none.png");
+    made.write("sparse/0/test.txt", "none.png\nd.png\n");
+    refused("none", &made, &eval, "test.txt, names none of the model's, none.png");
+    made.write("sparse/0/test.txt", "a\nb\nc\n");
+    refused("all", &made, &eval, "test.txt, leaves no photograph to train on");
+}

@@ -23,7 +23,7 @@ impl Note {
     }
 }
 
-fn load(made: &Made) -> Dataset {
+pub(crate) fn load(made: &Made) -> Dataset {
     load_with(made, &LoadOptions::default())
 }
 
@@ -36,7 +36,7 @@ fn names(views: &[View]) -> Vec<&str> {
 }
 
 /// Fails unless a note contains all of `words`, which are separated by commas.
-fn assert_noted(data: &Dataset, words: &str) {
+pub(crate) fn assert_noted(data: &Dataset, words: &str) {
     let is_noted = |note: &Note| words.split(", ").all(|word| note.contains(word));
     assert!(data.notes.iter().any(is_noted), "{words}: {:?}", data.notes);
 }

@@ -11,6 +11,7 @@ use super::accessors::{Accessor, Buffers, View};
 use super::layout::{LOG_SCALE, OPACITY_LOGIT, SPLATS, coefficient};
 use super::nodes;
 use crate::error::LoadError;
+use crate::models::ply::activation::may_be_logarithms;
 use crate::models::quantise::{log_of_scale, quantised_logit};
 use crate::models::rows::{Row, Rows, SplatFile};
 use crate::models::statement::stated_in_json;
@@ -20,9 +21,13 @@ use densify_core::files::max_unpacked_bytes;
 use densify_core::gaussians::{MAX_SH_DEGREE, sh_coefficients, sigmoid};
 
 /// The extension for splats in SPZ.
-const SPZ: &str = "KHR_gaussian_splatting_compression_spz_2";
+pub(super) const SPZ: &str = "KHR_gaussian_splatting_compression_spz_2";
 /// Extensions that a file may require: the extensions of splats, and extensions without effect on splats.
 const KNOWN: [&str; 4] = [SPLATS, SPZ, "KHR_materials_unlit", "KHR_mesh_quantization"];
+
+/// The values that are read of properties of [`SPLATS`]; the names with a dot are those of drafts.
+const READ: [(&str, &[&str]); 2] =
+    [("kernel", &["ellipse"]), ("colorSpace", &["srgb_rec709_display", "BT.709-sRGB", "BT.709"])];
 
 /// Largest accepted opacity: 1 plus rounding errors.
 const MAX_OPACITY: f32 = 1.001;
@@ -188,6 +193,14 @@ fn splats(
     extension: &Value,
 ) -> Result<SplatFile, LoadError> {
     let path = buffers.path;
+    for (key, known) in READ {
+        if let Some(stated) = extension.get(key)
+            && !stated.as_str().is_some_and(|stated| known.contains(&stated))
+        {
+            let problem = format!("{stated} is not supported, only {}", known.join(", "));
+            return Err(LoadError::damaged(path, format!("{SPLATS}: {key}"), problem));
+        }
+    }
     if let Some(view) = extension.pointer(&format!("/extensions/{SPZ}/bufferView")) {
         let view = view.as_u64().and_then(|view| usize::try_from(view).ok());
         let bytes = buffers.view(view.unwrap_or(usize::MAX))?;
@@ -196,15 +209,6 @@ fn splats(
             axes.map(|axes| format!("its SPZ states the axes {axes}, which glTF overrides"));
         file.notes.extend(ignored);
         return Ok(file);
-    }
-    let stated = |key: &str| extension.get(key).and_then(Value::as_str).unwrap_or_default();
-    if !matches!(stated("kernel"), "ellipse" | "") || stated("colorSpace") == "lin_rec709_display" {
-        let problem = format!(
-            "the kernel {:?} with colours in {:?}; only ellipses with sRGB colours are read",
-            stated("kernel"),
-            stated("colorSpace")
-        );
-        return Err(LoadError::damaged(path, SPLATS, problem));
     }
     let attribute = |name: &str, width: usize| match primitive.attributes.get(name) {
         None => Ok(None),
@@ -267,7 +271,15 @@ fn splats(
             sh: &sh,
         });
     }
-    rows.finish(path)
+    let mut file = rows.finish(path)?;
+    if log_scales.is_none() && may_be_logarithms(&file.gaussians, scales.as_chunks().0) {
+        file.notes.push(
+            "its scales may be logarithms, although glTF stores scales as they are: if all Gaussians are too large or too \
+             small, export the file again"
+                .to_owned(),
+        );
+    }
+    Ok(file)
 }
 
 /// Appends a part; the result has the higher of the two degrees.

@@ -37,6 +37,7 @@ fn remedy(vertices: &Element) -> &'static str {
 /// When the file is unreadable or contradicts itself, a property is missing (as in the compressed
 /// layout), or more than 1 % of the Gaussians are not finite.
 pub(super) fn read(path: &Path) -> Result<SplatFile, LoadError> {
+    refuse_other_colours(path)?;
     let mut ply = Ply::open(path)?;
     let vertices = ply.element("vertex")?;
     let sh_degree = sh_degree(&vertices).map_err(|rest| {
@@ -90,6 +91,21 @@ pub(super) fn read(path: &Path) -> Result<SplatFile, LoadError> {
         file.notes.extend(note);
     }
     Ok(file)
+}
+
+/// Refuses colours that are not sRGB according to the element `color_space` of SHARP, whose value is 0 for sRGB and 1 for
+/// linear colours.
+fn refuse_other_colours(path: &Path) -> Result<(), LoadError> {
+    const ELEMENT: &str = "color_space";
+    let mut ply = Ply::open(path)?;
+    let Ok(element) = ply.element(ELEMENT) else { return Ok(()) };
+    let mut other = None;
+    ply.each_row(&element, &[0], |row| other = other.or(row.iter().copied().find(|v| *v != 0.0)))?;
+    other.map_or(Ok(()), |value| {
+        let problem = format!("{value} means colours that are not sRGB");
+        let remedy = "export the model with sRGB colours, as current versions of SHARP do";
+        Err(LoadError::malformed(path, ELEMENT, problem, remedy))
+    })
 }
 
 /// The point from which positions in f64 are measured, so that f32 can hold them; 0 unless they are far from 0.

@@ -67,6 +67,43 @@ fn damaged_rows_are_dropped_up_to_one_percent() {
     assert!(message.contains("3 of 200") && message.contains("file.ply"), "{message}");
 }
 
+/// SHARP states the colours in an element of its own, after the splats.
+#[test]
+fn colours_that_are_not_srgb_are_refused() {
+    let with = |value: u8| {
+        let mut bytes = written(PLY, &model(3, 0)).unwrap();
+        let end = bytes.windows(11).position(|part| part == b"end_header\n").unwrap();
+        let element = b"element color_space 1\nproperty uchar color_space\n";
+        bytes.splice(end..end, *element);
+        bytes.push(value);
+        bytes
+    };
+    let (_folder, path) = saved("file.ply", with(0));
+    assert_eq!(read(&path).unwrap().gaussians.len(), 3);
+    let (_folder, path) = saved("file.ply", with(1));
+    let message = read(&path).unwrap_err().to_string();
+    assert!(message.contains("file.ply: color_space: 1 means"), "{message}");
+}
+
+/// An interrupted export leaves rows of zeros.
+#[test]
+fn rows_of_zeros_are_dropped_up_to_one_percent() {
+    let mut some = model(300, 1);
+    let zero = |some: &mut Gaussians, row: usize| {
+        (some.means[row], some.log_scales[row], some.quats[row]) = ([0.0; 3], [0.0; 3], [0.0; 4]);
+        some.opacity_logits[row] = 0.0;
+        some.sh[12 * row..12 * (row + 1)].fill(0.0);
+    };
+    (297..300).for_each(|row| zero(&mut some, row));
+    let (_folder, path) = saved("file.ply", written(PLY, &some).unwrap());
+    let found = read(&path).unwrap();
+    assert_eq!((found.dropped, found.repaired, found.gaussians.len()), (3, 0, 297));
+    zero(&mut some, 0);
+    let (_folder, path) = saved("file.ply", written(PLY, &some).unwrap());
+    let message = read(&path).unwrap_err().to_string();
+    assert!(message.contains("4 of 300") && message.contains("only zeros"), "{message}");
+}
+
 /// Some programs write the logarithm of 0, and the logits of 0 and 1.
 #[test]
 fn infinite_opacities_and_flat_gaussians_are_read() {

@@ -1,6 +1,8 @@
 //! Turns frames into photographs with their views: checks image files against cameras, and replaces distorted
 //! lenses by pinhole cameras.
 
+mod notes;
+
 use std::cell::OnceCell;
 use std::path::Path;
 
@@ -15,10 +17,6 @@ use super::undistort::{Pinhole, Undistortion};
 use super::{Frame, LoadOptions, MaskMode, Note, Resolution, View};
 use crate::error::{LoadError, LoadRemedy};
 use densify_core::camera::Camera;
-use densify_core::numbers::counted;
-
-/// Share of a photograph that may be cropped without a note.
-const SILENTLY_CROPPED: f64 = 0.005;
 
 /// The views of one photograph, which are never split between training and test.
 #[derive(Debug)]
@@ -49,17 +47,7 @@ pub(super) fn photographs(
     // All frames are checked before the first error is reported, so that the message does not depend on timing.
     let checked: Vec<_> = frames.par_iter().map(|frame| check(listing, frame)).collect();
     let checked: Vec<Checked> = checked.into_iter().collect::<Result<_, _>>()?;
-    let texts =
-        [turned_note(frames, &checked), orientation_note(frames, &checked), masks_note(frames)];
-    notes.extend(texts.into_iter().flatten().map(Note::Text));
-    if let (Some(Resolution::Width(width)), Some(first)) = (options.resolution, frames.first())
-        && checked.iter().any(|checked| checked.header.width < width)
-    {
-        let first = &first.name;
-        notes.push(Note::Text(format!(
-            "images narrower than {width} px are not enlarged ({first})"
-        )));
-    }
+    notes.extend(notes::photograph_notes(frames, &checked, options));
     // Here a run is a sequence of photographs with the same lens, and thus the same pinholes.
     let mut runs = Vec::new();
     let mut first = 0;
@@ -78,7 +66,10 @@ pub(super) fn photographs(
     };
     let all: Vec<Result<Option<Pinholes>, _>> = runs.par_iter().map(pinholes).collect();
     let all: Vec<Option<Pinholes>> = all.into_iter().collect::<Result<_, _>>()?;
-    notes.extend(pinhole_notes(runs.iter().map(|(_, run)| run.len()).zip(&all), options.keep_fov));
+    notes.extend(notes::pinhole_notes(
+        runs.iter().map(|(_, run)| run.len()).zip(&all),
+        options.keep_fov,
+    ));
     let by_frame = runs.iter().zip(&all).flat_map(|((_, run), all)| run.iter().map(move |_| all));
     let by_frame: Vec<&Option<Pinholes>> = by_frame.collect();
     let each = frames.iter().zip(checked).zip(by_frame);
@@ -96,12 +87,15 @@ struct Checked {
     exif: Option<Exif>,
     /// True if EXIF asks for a quarter turn, and the pose file does not say whether its poses include it.
     is_turn_ambiguous: bool,
+    /// Name of the image's colour space; `None` if it is sRGB.
+    colours: Option<String>,
 }
 
 /// Checks an image's header against its camera. An image that fits only after the quarter turn in its EXIF is turned:
 /// some programs turn images before they estimate poses, others do not.
 fn check(listing: &Path, frame: &Frame) -> Result<Checked, LoadError> {
     let mut header = frame.header.map_or_else(|| images::read_header(&frame.image), Ok)?;
+    let colours = images::read_colours(&frame.image)?.map(|colours| colours.name);
     let exif = OnceCell::new();
     let quarter_turn = || exif.get_or_init(|| Exif::open(&frame.image)).quarter_turn();
     let lens = &frame.lens;
@@ -132,35 +126,7 @@ fn check(listing: &Path, frame: &Frame) -> Result<Checked, LoadError> {
         return Err(LoadError::malformed(listing, &frame.name, problem, remedy));
     }
     let is_turn_ambiguous = frame.header.is_some() && quarter_turn().is_some();
-    Ok(Checked { header, lens, exif: exif.into_inner(), is_turn_ambiguous })
-}
-
-/// Note about photographs that are turned to match their cameras.
-fn turned_note(frames: &[Frame], checked: &[Checked]) -> Option<String> {
-    let turned = || frames.iter().zip(checked).filter(|(_, checked)| checked.header.turn.is_some());
-    let (first, _) = turned().next()?;
-    Some(format!(
-        "{} rotated by 90 degrees as EXIF says, to match the image sizes of the cameras (first: {})",
-        counted(turned().count(), "photograph"),
-        first.name
-    ))
-}
-
-/// Note about photographs whose EXIF orientation may or may not be part of the poses.
-fn orientation_note(frames: &[Frame], checked: &[Checked]) -> Option<String> {
-    let ambiguous = || frames.iter().zip(checked).filter(|(_, checked)| checked.is_turn_ambiguous);
-    let first = &ambiguous().next()?.0.name;
-    Some(format!(
-        "{} used as stored, although EXIF asks for a rotation by 90 degrees (first: {first}): the pose file states no \
-         image size that would show whether its poses include the rotation. If the model is poor, rotate the files",
-        counted(ambiguous().count(), "photograph")
-    ))
-}
-
-/// Note about the number of photographs with masks.
-fn masks_note(frames: &[Frame]) -> Option<String> {
-    let masked = frames.iter().filter(|frame| frame.mask.is_some()).count();
-    (masked > 0).then(|| format!("{masked} of {} photographs have a mask", frames.len()))
+    Ok(Checked { header, lens, exif: exif.into_inner(), is_turn_ambiguous, colours })
 }
 
 /// The error for a lens that no pinhole camera can replace, with the remedy.
@@ -173,41 +139,6 @@ fn lens_error(frame: &Frame, lens: &Lens, error: PinholeError) -> LoadError {
     let remedy =
         "calibrate again, or undistort the images first, e.g. with `colmap image_undistorter`";
     LoadError::malformed(image, origin, problem, remedy)
-}
-
-/// Notes about photographs that become several views or are cropped. For each lens, `all` has the number of its
-/// photographs and its pinholes.
-fn pinhole_notes<'a>(
-    all: impl Iterator<Item = (usize, &'a Option<Pinholes>)> + Clone,
-    keep_fov: bool,
-) -> Vec<Note> {
-    let all = all.filter_map(|(count, pinholes)| Some((count, pinholes.as_ref()?)));
-    let mut notes = Vec::new();
-    let wide = || all.clone().filter(|(_, pinholes)| pinholes.faces.len() > 1);
-    if let Some(widest) = wide().max_by_key(|(_, pinholes)| pinholes.faces.len()) {
-        let names: Vec<&str> = widest.1.faces.iter().map(|(name, _)| *name).collect();
-        notes.push(Note::Text(format!(
-            "the field of view of {} photographs is too wide for one pinhole camera; each becomes up to {} views: {}",
-            wide().map(|(count, _)| count).sum::<usize>(),
-            names.len(),
-            names.join(", ")
-        )));
-    }
-    let lost = all.clone().filter(|(_, pinholes)| pinholes.cropped > SILENTLY_CROPPED);
-    let most = lost.clone().map(|(_, pinholes)| pinholes.cropped).fold(0.0, f64::max);
-    if most > 0.0 {
-        let percent = (100.0 * most).max(1.0);
-        let photographs = lost.map(|(count, _)| count).sum();
-        notes.push(if keep_fov {
-            Note::Text(format!(
-                "up to {percent:.0} % of each of {photographs} photographs is beyond what the lens model can invert, and \
-                 is not used"
-            ))
-        } else {
-            Note::Cropped { percent, photographs }
-        });
-    }
-    notes
 }
 
 /// The views of a frame whose image and lens have been checked.
