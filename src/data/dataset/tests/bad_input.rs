@@ -234,6 +234,21 @@ const TRANSFORMS: &[Replacement] = &[
     ("/frames/1/transform_matrix/0/3", "null", "frames[1].transform_matrix"),
     ("/frames/0/transform_matrix/0/0", "2.0", "frames[0].transform_matrix, a.png, orthonormal"),
     ("/frames/0/transform_matrix/0/0", "-1.0", "frames[0].transform_matrix, reflection"),
+    (
+        "/frames/1/transform_matrix",
+        "[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [2, 3, 4, 1]]",
+        "frames[1].transform_matrix, transposed, correct the file",
+    ),
+    (
+        "/frames/1/transform_matrix",
+        "[[1, 0, 0, 2], [0, 1, 0, 3], [0, 0, 1, 4], [0, 0, 0, 2]]",
+        "frames[1].transform_matrix, fourth row is [0.0, 0.0, 0.0, 2.0]",
+    ),
+    (
+        "/frames/1/transform_matrix",
+        "[[1, 0, 0, 2], [0, 1, 0, 3], [0, 0, 1, 4], [0, 0, 0]]",
+        "frames[1].transform_matrix, 4 rows of 4 numbers",
+    ),
     ("/ply_file_path", "\"../p.ply\"", "ply_file_path, `..`"),
     ("/ply_file_path", "\"p.ply\"", "ply_file_path, p.ply"),
     ("/fl_x", "", "fl_x, camera_angle_x"),
