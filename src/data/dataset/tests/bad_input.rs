@@ -258,6 +258,8 @@ const TRANSFORMS: &[Replacement] = &[
     ("/camera_model", "\"EQUIRECTANGULAR\"", "camera_model, EQUIRECTANGULAR, faces of a cube"),
     ("/camera_model", "\"VR180_L\"", "camera_model, VR180_L, image_undistorter"),
     ("/camera_model", "7", "camera_model, string"),
+    ("/is_fisheye", "\"false\"", "transforms.json, is_fisheye, neither true nor false"),
+    ("/is_fisheye", "2", "transforms.json, is_fisheye, neither true nor false"),
     ("/k1", "-5.0", "folds over, a.png, largest usable field, KeepFieldOfView"),
     ("/k1", "-1e9", "folds over, a.png, calibrate again"),
     ("/k1", "\"x\"", "k1, number"),

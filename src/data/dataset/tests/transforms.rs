@@ -27,3 +27,13 @@ fn uniformly_scaled_axes_do_not_matter() {
         }
     }
 }
+
+#[test]
+fn fisheyes_may_be_marked_by_a_number() {
+    for (value, is_fisheye) in
+        [(json!(0), false), (json!(0.0), false), (json!(1), true), (Value::Null, false)]
+    {
+        let data = load(&Made::transforms(|json| json["is_fisheye"] = value.clone()));
+        assert_eq!(data.train[0].source.undistortion.is_some(), is_fisheye, "{value}");
+    }
+}

@@ -81,4 +81,15 @@ impl<'a> Fields<'a> {
         }
         Err(self.fault(field, format!("{value} px is not an image size")))
     }
+
+    /// A field that is true or false, or 1 or 0; false if it is absent.
+    pub(super) fn flag(&self, field: &str) -> Result<bool, LoadError> {
+        match self.inherited(field) {
+            None => Ok(false),
+            Some(Value::Bool(value)) => Ok(*value),
+            Some(value) if value.as_f64() == Some(0.0) => Ok(false),
+            Some(value) if value.as_f64() == Some(1.0) => Ok(true),
+            Some(value) => Err(self.fault(field, format!("{value} is neither true nor false"))),
+        }
+    }
 }

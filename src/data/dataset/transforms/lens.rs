@@ -76,8 +76,7 @@ impl Fields<'_> {
             Some(Value::String(model)) => Some(model.as_str()),
             Some(_) => return Err(self.fault("camera_model", "it is not a string")),
         };
-        let is_fisheye = named == Some(FISHEYE)
-            || self.inherited("is_fisheye").is_some_and(|value| value.as_bool() != Some(false));
+        let is_fisheye = self.flag("is_fisheye")? || named == Some(FISHEYE);
         if let Some(model) = named.filter(|model| *model != FISHEYE && !PINHOLES.contains(model)) {
             let supported = format!("{}, {FISHEYE}", PINHOLES.join(", "));
             let field = self.full("camera_model");
