@@ -260,6 +260,7 @@ const TRANSFORMS: &[Replacement] = &[
     ("/camera_model", "7", "camera_model, string"),
     ("/is_fisheye", "\"false\"", "transforms.json, is_fisheye, neither true nor false"),
     ("/is_fisheye", "2", "transforms.json, is_fisheye, neither true nor false"),
+    ("/k4", "0.08", "transforms.json, k4, 0.08, two meanings, FULL_OPENCV, undistort"),
     ("/k1", "-5.0", "folds over, a.png, largest usable field, KeepFieldOfView"),
     ("/k1", "-1e9", "folds over, a.png, calibrate again"),
     ("/k1", "\"x\"", "k1, number"),

@@ -24,6 +24,8 @@ const PINHOLES: [&str; 7] = [
 ];
 /// Name of the camera model that is a fisheye with k1 to k4.
 const FISHEYE: &str = "OPENCV_FISHEYE";
+/// Name of the pinhole whose k4 to k6 are OpenCV's.
+const RATIONAL: &str = "FULL_OPENCV";
 
 impl Fields<'_> {
     /// The image size that the intrinsics are for, if the file states it.
@@ -87,6 +89,9 @@ impl Fields<'_> {
         } else {
             (Projection::Perspective, &OPENCV_FIELDS[..])
         };
+        if !is_fisheye && named != Some(RATIONAL) {
+            self.check_k4()?;
+        }
         let mut distortion = Distortion::none(plane);
         for (field, _) in OPENCV_FIELDS {
             let value = self.number(field)?.unwrap_or(0.0);
@@ -101,5 +106,21 @@ impl Fields<'_> {
             }
         }
         Ok(distortion)
+    }
+
+    /// Refuses a k4 of a pinhole that may be nerfstudio's: there it is the coefficient of r⁸, in OpenCV that of r² in
+    /// the denominator. Only OpenCV has k5 and k6.
+    fn check_k4(&self) -> Result<(), LoadError> {
+        let [k4, k5, k6] = ["k4", "k5", "k6"].map(|field| self.number(field));
+        let (k4, k5, k6) = (k4?.unwrap_or(0.0), k5?.unwrap_or(0.0), k6?.unwrap_or(0.0));
+        if k4 == 0.0 || k5 != 0.0 || k6 != 0.0 {
+            return Ok(());
+        }
+        let problem = format!(
+            "k4 = {k4} has two meanings: in OpenCV it divides by 1 + k4 r², in nerfstudio and Metashape it adds k4 r⁸"
+        );
+        let remedy = "if it is OpenCV's, set `camera_model` to FULL_OPENCV; else calibrate without k4, or undistort \
+                      the images first";
+        Err(LoadError::malformed(self.path, self.full("k4"), problem, remedy))
     }
 }
