@@ -17,7 +17,7 @@ const MAX_FISHEYE_FOV: f64 = 720.0;
 const MAX_OMEGA: f64 = 3.04;
 
 /// Largest accepted entry of |RᵀR − I|; smaller deviations are corrected.
-const ROTATION_TOLERANCE: f64 = 1e-3;
+pub(super) const ROTATION_TOLERANCE: f64 = 1e-3;
 
 pub(super) const POSE_REMEDY: &str = "repair the pose or remove the frame";
 

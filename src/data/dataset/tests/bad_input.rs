@@ -216,6 +216,9 @@ const TRANSFORMS: &[Replacement] = &[
     ("/frames", "3", "transforms.json, frames"),
     ("/frames", "[]", "transforms.json, no image"),
     ("/frames/1", "3", "frames[1]"),
+    ("/test_frames", "3", "transforms.json, test_frames, list of frames"),
+    ("/test_frames", "[{}]", "transforms.json, test_frames[0].file_path, missing"),
+    ("/frames/1/is_bad", "\"no\"", "frames[1].is_bad, neither true nor false"),
     ("/frames/1/file_path", "", "frames[1].file_path"),
     ("/frames/1/file_path", "7", "frames[1].file_path, string"),
     ("/frames/1/file_path", "\"../b.png\"", "frames[1].file_path, `..`"),
@@ -234,15 +237,38 @@ const TRANSFORMS: &[Replacement] = &[
     ("/frames/1/transform_matrix/0/3", "null", "frames[1].transform_matrix"),
     ("/frames/0/transform_matrix/0/0", "2.0", "frames[0].transform_matrix, a.png, orthonormal"),
     ("/frames/0/transform_matrix/0/0", "-1.0", "frames[0].transform_matrix, reflection"),
+    (
+        "/frames/1/transform_matrix",
+        "[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [2, 3, 4, 1]]",
+        "frames[1].transform_matrix, transposed, correct the file",
+    ),
+    (
+        "/frames/1/transform_matrix",
+        "[[1, 0, 0, 2], [0, 1, 0, 3], [0, 0, 1, 4], [0, 0, 0, 2]]",
+        "frames[1].transform_matrix, fourth row is [0.0, 0.0, 0.0, 2.0]",
+    ),
+    (
+        "/frames/1/transform_matrix",
+        "[[1, 0, 0, 2], [0, 1, 0, 3], [0, 0, 1, 4], [0, 0, 0]]",
+        "frames[1].transform_matrix, 4 rows of 4 numbers",
+    ),
     ("/ply_file_path", "\"../p.ply\"", "ply_file_path, `..`"),
+    ("/ply_file_path", "\"images/a.png\"", "ply_file_path, a.png, not a PLY file, convert"),
     ("/ply_file_path", "\"p.ply\"", "ply_file_path, p.ply"),
-    ("/fl_x", "", "fl_x, camera_angle_x"),
     ("/fl_x", "0", "intrinsics, fx"),
     ("/w", "20.5", "w, 20.5"),
     ("/w", "-20", "w, -20"),
     ("/camera_model", "\"EQUIRECTANGULAR\"", "camera_model, EQUIRECTANGULAR, faces of a cube"),
     ("/camera_model", "\"VR180_L\"", "camera_model, VR180_L, image_undistorter"),
     ("/camera_model", "7", "camera_model, string"),
+    ("/equirectangular", "true", "transforms.json, equirectangular, EQUIRECTANGULAR, cube"),
+    ("/frames/2/latlong", "true", "frames[2].latlong, EQUIRECTANGULAR, faces of a cube"),
+    ("/ftheta_p1", "0.001", "transforms.json, ftheta_p1, f-theta, fisheye model"),
+    ("/white_transparent", "true", "white_transparent, transparent in the images"),
+    ("/black_transparent", "true", "black_transparent, transparent in the images"),
+    ("/is_fisheye", "\"false\"", "transforms.json, is_fisheye, neither true nor false"),
+    ("/is_fisheye", "2", "transforms.json, is_fisheye, neither true nor false"),
+    ("/k4", "0.08", "transforms.json, k4, 0.08, two meanings, FULL_OPENCV, undistort"),
     ("/k1", "-5.0", "folds over, a.png, largest usable field, KeepFieldOfView"),
     ("/k1", "-1e9", "folds over, a.png, calibrate again"),
     ("/k1", "\"x\"", "k1, number"),
@@ -273,6 +299,8 @@ fn faults_of_transforms_json_are_named() {
     let long = format!("\"{}\"", "b".repeat(5000));
     let made = Made::transforms(|json| set(json, "/frames/1/file_path", &long));
     refused("long", &made, &options, "frames[1].file_path, 4 KiB");
+    let made = Made::transforms(|json| ["/fl_x", "/fl_y"].iter().for_each(|f| set(json, f, "")));
+    refused("no focal length", &made, &options, "fl_x, camera_angle_x");
     let made = Made::transforms(|json| {
         set(json, "/fl_x", "");
         set(json, "/camera_angle_x", "4.0");

@@ -17,7 +17,7 @@ fn colmap(camera: &str) -> Made {
 #[test]
 fn nerfstudio_and_colmap_lenses_agree() {
     type Fields = &'static [(&'static str, f64)];
-    let cases: [(&str, &str, Fields); 3] = [
+    let cases: [(&str, &str, Fields); 4] = [
         (
             "OPENCV_FISHEYE 20 12 15 16 10 6 0.02 -0.01 0.003 0.0004",
             "OPENCV_FISHEYE",
@@ -36,6 +36,11 @@ fn nerfstudio_and_colmap_lenses_agree() {
                 ("k5", 0.02),
                 ("k6", 0.03),
             ],
+        ),
+        (
+            "FULL_OPENCV 20 12 15 16 10 6 0.02 0 0 0 0 0.01 0 0",
+            "FULL_OPENCV",
+            &[("k1", 0.02), ("k4", 0.01)],
         ),
         ("SIMPLE_RADIAL_FISHEYE 20 12 15 10 6 0.02", "is_fisheye", &[("fl_y", 15.0), ("k1", 0.02)]),
     ];

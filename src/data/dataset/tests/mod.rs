@@ -10,6 +10,7 @@ mod masks;
 mod phones;
 mod realitycapture;
 mod shared;
+mod transforms;
 
 use std::path::Path;
 
