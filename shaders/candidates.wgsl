@@ -2,8 +2,6 @@
 // errors; see src/render/cpu/candidates.rs.
 
 @group(0) @binding(1) var<storage, read> state: State;
-@group(0) @binding(2) var<storage, read> list: array<u32>;
-@group(0) @binding(3) var<storage, read> row_of_slot: array<u32>;
 @group(0) @binding(4) var<storage, read> tile_starts: array<u32>;
 @group(0) @binding(5) var<storage, read> splats: array<vec4<f32>>;
 @group(0) @binding(6) var<storage, read> rows: array<f32>;
@@ -40,7 +38,7 @@ fn surface_row(tile: u32, at: vec2<f32>, is_median: bool) -> u32 {
     var best = NONE;
     var most = 0.0;
     for (var k = tile_starts[tile]; k < tile_starts[tile + 1u]; k++) {
-        let row = row_of_slot[list[k]];
+        let row = row_at(k);
         let a = splats[3u * row];
         let b = splats[3u * row + 1u];
         let d = at - a.xy;

@@ -14,6 +14,8 @@ macro_rules! shader {
 const VIEW: &str = shader!("shared/view");
 const GAUSSIAN: &str = shader!("shared/gaussian");
 const RANDOM: &str = shader!("shared/random");
+const LIST_ROWS: &str = shader!("shared/list_rows");
+const LIST_SLOTS: &str = shader!("shared/list_slots");
 const QUADS: &str = shader!("shared/quads");
 const BATCH: &str = shader!("shared/batch");
 const SLOTS: &str = shader!("shared/slots");
@@ -33,6 +35,10 @@ enum On {
     Atomics,
     /// All devices; the invocations of a tile share splats through subgroups where these are available.
     Tiles,
+    /// All devices; reads the tile lists.
+    Lists,
+    /// All devices; writes the tile lists.
+    Emits,
     /// All devices.
     All,
 }
@@ -53,7 +59,7 @@ const fn stage(name: &'static str, on: On, texts: &'static [&'static str]) -> St
 /// All stages. [`Stage::text`] adds the texts that depend on the device.
 pub const STAGES: &[Stage] = &[
     stage("project", On::All, &[VIEW, GAUSSIAN, shader!("project")]),
-    stage("tiles", On::All, &[VIEW, shader!("tiles")]),
+    stage("tiles", On::Emits, &[VIEW, shader!("tiles")]),
     stage("rasterize", On::Tiles, &[VIEW, QUADS, shader!("rasterize")]),
     stage("exposure", On::All, &[VIEW, shader!("exposure")]),
     stage("loss", On::All, &[VIEW, shader!("loss")]),
@@ -68,7 +74,7 @@ pub const STAGES: &[Stage] = &[
     stage("adam", On::All, &[VIEW, RANDOM, STEPS, shader!("adam")]),
     stage("signals", On::All, &[VIEW, RECORD, shader!("signals")]),
     stage("apply", On::All, &[VIEW, RANDOM, shader!("apply")]),
-    stage("candidates", On::All, &[VIEW, RANDOM, shader!("candidates")]),
+    stage("candidates", On::Lists, &[VIEW, RANDOM, shader!("candidates")]),
     stage("observe", On::Slots, &[VIEW, QUADS, BLENDED, shader!("observe")]),
     stage("observe_atomic", On::Atomics, &[VIEW, QUADS, BLENDED, shader!("observe_atomic")]),
     stage("audit", On::All, &[VIEW, shader!("audit")]),
@@ -79,14 +85,18 @@ impl Stage {
     pub fn text(&self, accumulation: Accumulation) -> Option<String> {
         let more: &[&str] = match (self.on, accumulation) {
             (On::All, _) => &[],
-            (On::Tiles, Accumulation::Slots) => &[BATCH],
-            (On::Tiles, _) => &[SUBGROUPS],
-            (On::Slots, Accumulation::Slots) => &[BATCH, SLOTS],
+            (On::Lists, Accumulation::Slots) => &[LIST_SLOTS],
+            (On::Lists, _) => &[LIST_ROWS],
+            (On::Emits, Accumulation::Slots) => &[shader!("shared/emit_slots")],
+            (On::Emits, _) => &[shader!("shared/emit_rows")],
+            (On::Tiles, Accumulation::Slots) => &[LIST_SLOTS, BATCH],
+            (On::Tiles, _) => &[LIST_ROWS, SUBGROUPS],
+            (On::Slots, Accumulation::Slots) => &[LIST_SLOTS, BATCH, SLOTS],
             (On::Atomics, Accumulation::SubgroupCas) => {
-                &[SUBGROUPS, ATOMICS, shader!("shared/sums_cas")]
+                &[LIST_ROWS, SUBGROUPS, ATOMICS, shader!("shared/sums_cas")]
             }
             (On::Atomics, Accumulation::SubgroupAtomics) => {
-                &[SUBGROUPS, ATOMICS, shader!("shared/sums_f32")]
+                &[LIST_ROWS, SUBGROUPS, ATOMICS, shader!("shared/sums_f32")]
             }
             (On::Slots, _) | (On::Atomics, Accumulation::Slots) => return None,
         };

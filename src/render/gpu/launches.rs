@@ -16,7 +16,8 @@ use crate::{Accumulation, NumberKind};
 /// Sources of the error per pixel: the loss's error, or its gradient.
 const ERROR_MAPS: [&str; 2] = ["error", "pixel gradient"];
 const KEYS: [&str; 2] = ["keys 0", "keys 1"];
-const VALUES: [&str; 2] = ["values 0", "values 1"];
+/// The sorted values end in the first, the lists.
+const VALUES: [&str; 2] = ["list", "values"];
 
 /// A kernel's variable and the buffer bound to it.
 pub(super) type Rebinding = (&'static str, &'static str);
@@ -105,10 +106,7 @@ fn launch(
         .map(|binding| {
             let other = rebindings.iter().find(|(variable, _)| *variable == binding.name);
             let name = other.map_or(&*binding.name, |(_, buffer)| buffer);
-            BindGroupEntry {
-                binding: binding.number,
-                resource: buffers.get(name).as_entire_binding(),
-            }
+            BindGroupEntry { binding: binding.number, resource: buffers.binding(name) }
         })
         .collect();
     let bindings = device.create_bind_group(&BindGroupDescriptor {
@@ -129,7 +127,7 @@ impl<L> Launches<L> {
         bind: Bind<'_, L>,
         sizes: &Sizes,
     ) -> Self {
-        let rebound = rebound();
+        let rebound = rebound(sizes.accumulation);
         let launches = |kernel: &str| match rebound.get(base_name(kernel)) {
             None => vec![bind(kernel, &[])],
             Some(lists) => lists.iter().map(|rebindings| bind(kernel, rebindings)).collect(),
@@ -174,13 +172,16 @@ pub(super) fn base_name(kernel: &str) -> &str {
 }
 
 /// The kernels with variables that are bound to buffers of other names, with the exceptions of each launch. Of two
-/// launches, the first reads `keys 0` and `values 0`.
-pub(super) fn rebound() -> HashMap<&'static str, Vec<Vec<Rebinding>>> {
+/// launches, the first reads `keys 0` or writes the lists.
+pub(super) fn rebound(accumulation: Accumulation) -> HashMap<&'static str, Vec<Vec<Rebinding>>> {
     let two = |rebindings: &dyn Fn(usize) -> Vec<Rebinding>| vec![rebindings(0), rebindings(1)];
-    let list = |i: usize| ("list", VALUES[i]);
-    let scatter = |i: usize, values_to| {
-        let from = [("keys in", KEYS[i]), ("values in", VALUES[i])];
-        [&from[..], &[("keys out", KEYS[1 - i]), ("values out", values_to)]].concat()
+    let scatter = |keys: usize, values: usize, values_to| {
+        let from = [("keys in", KEYS[keys]), ("values in", VALUES[values])];
+        [&from[..], &[("keys out", KEYS[1 - keys]), ("values out", values_to)]].concat()
+    };
+    let emitted = |i: usize| match accumulation {
+        Accumulation::Slots => "row of slot",
+        _ => VALUES[i],
     };
     let adam = |part: usize| {
         let moments = [("first", FIRST[part]), ("second", SECOND[part])];
@@ -191,11 +192,18 @@ pub(super) fn rebound() -> HashMap<&'static str, Vec<Vec<Rebinding>>> {
         ("compact", vec![vec![("keys out", KEYS[0]), ("values out", VALUES[0])]]),
         ("count_digits", keys_in.clone()),
         ("find_tiles", keys_in),
-        // The third launch writes the order of rows.
-        ("scatter", vec![scatter(0, VALUES[1]), scatter(1, VALUES[0]), scatter(1, "order")]),
-        ("emit_entries", vec![vec![("keys out", KEYS[0])]]),
-        ("rasterize", two(&|i| vec![list(i)])),
-        ("rasterize_bwd", two(&|i| vec![list(i)])),
+        // The first four by the numbers of their keys and values; the fifth writes the order of rows.
+        (
+            "scatter",
+            vec![
+                scatter(0, 0, VALUES[1]),
+                scatter(0, 1, VALUES[0]),
+                scatter(1, 0, VALUES[1]),
+                scatter(1, 1, VALUES[0]),
+                scatter(1, 1, "order"),
+            ],
+        ),
+        ("emit_entries", two(&|i| vec![("keys out", KEYS[0]), ("values out", emitted(i))])),
         ("similarity", vec![vec![("gradient", "pixel gradient")]]),
         ("pixel_gradient", vec![vec![("gradient", "pixel gradient")]]),
         ("expose_bwd", vec![vec![("gradient", "pixel gradient")]]),
@@ -203,12 +211,12 @@ pub(super) fn rebound() -> HashMap<&'static str, Vec<Vec<Rebinding>>> {
         ("adam_geometry", vec![adam(0)]),
         // Borrows the buffer of prefix sums, which is long enough and unused between two steps.
         ("present", vec![vec![("signals", "sums")]]),
-        // Borrows the gradients of the rows, which are unused between two steps.
-        ("surface", two(&|i| vec![list(i), ("pixels", "ops"), ("points", "gradient")])),
+        // Borrows the sums of the rows, which are unused before the backward pass.
+        ("surface", vec![vec![("pixels", "ops"), ("points", "row sums")]]),
         ("count_errors", two(&|i| vec![("map", ERROR_MAPS[i])])),
         ("narrow", vec![vec![("worst", "gradient")]]),
         ("write_worst", two(&|i| vec![("map", ERROR_MAPS[i]), ("worst", "gradient")])),
-        ("replay", two(&|i| vec![list(i), ("map", "pixel gradient")])),
+        ("replay", vec![vec![("map", "pixel gradient")]]),
         ("gather", vec![vec![("all records", "records")]]),
         ("gather_columns", vec![vec![("all records", "records")]]),
     ])

@@ -18,7 +18,10 @@ pub(super) fn max_pairs(device: &Device, needs: &Needs) -> u64 {
         Accumulation::Slots => RecordLayout::new(needs.signals).stride() as u64,
         Accumulation::SubgroupCas | Accumulation::SubgroupAtomics => 1,
     };
-    (device.largest_binding() / (4 * numbers)).min(MAX_ENTRIES)
+    let by_binding = device.largest_binding() / (4 * numbers);
+    // Three lists are sorted in one buffer, each at an aligned place.
+    let by_buffer = (device.summary.largest_buffer / 3).saturating_sub(256) / 4;
+    by_binding.min(by_buffer).min(MAX_ENTRIES)
 }
 
 /// Sizes of all buffers.

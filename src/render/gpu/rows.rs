@@ -44,8 +44,6 @@ pub(super) enum Content {
     Dominated,
     /// Gradients of splats, summed over the current view.
     SplatGradients,
-    /// Gradients of parameters in the current view.
-    RowGradients,
 }
 
 /// The effect of an edit on an array. Moved rows keep their numbers, except in [untouched](Self::Untouched) arrays.
@@ -99,10 +97,8 @@ impl Content {
             Self::MaskMoments => (Section::Policy, "masks", Cleared, true, None),
             Self::Dominated => (Section::Policy, "dominated pixels", Untouched, false, None),
             Self::SplatGradients => (Section::Gradients, "splat gradients", Untouched, false, None),
-            Self::RowGradients => (Section::Gradients, "row gradients", Untouched, false, None),
         };
-        let is_for_training =
-            matches!(edited, Cleared) || matches!(self, Self::Masks | Self::RowGradients);
+        let is_for_training = matches!(edited, Cleared) || matches!(self, Self::Masks);
         Traits { section, line, edited, is_saved, audited, is_for_training }
     }
 }
@@ -135,11 +131,12 @@ impl RowArray {
 }
 
 /// All arrays for models of this SH degree. `may_wait`: gradients of the geometry and band 0, and those of bands 1–3,
-/// may wait for a step. The last argument has the numbers per row of signals, records, dominated pixels and masks.
+/// may wait for a step. The last argument has the numbers per row of slots, signals, records, dominated pixels and
+/// masks.
 pub(super) fn row_arrays(
     sh_degree: u8,
     may_wait: [bool; 2],
-    [planes, fields, counts, masks]: [usize; 4],
+    [slots, planes, fields, counts, masks]: [usize; 5],
 ) -> Vec<RowArray> {
     let geometry = 0..ModelArray::Sh.parameters(sh_degree).start;
     let band = |band: usize| {
@@ -171,9 +168,8 @@ pub(super) fn row_arrays(
         ("footprints", 4, Content::Projected),
         ("depths", 1, Content::Projected),
         ("order", 1, Content::Projected),
-        ("slots of row", 2, Content::Projected),
+        ("slots of row", slots, Content::Projected),
         ("row sums", fields, Content::SplatGradients),
-        ("gradient", GRADIENT, Content::RowGradients),
         ("dominant", counts, Content::Dominated),
         ("mask offsets", masks, Content::Masks),
         ("mask moments", 2 * masks, Content::MaskMoments),
@@ -186,6 +182,6 @@ pub(super) fn row_arrays(
 
 /// Bytes per row of the widest array for models of this SH degree, for any policy.
 pub(super) fn widest_row(sh_degree: u8) -> u64 {
-    let arrays = row_arrays(sh_degree, [false; 2], [0; 4]);
-    arrays.iter().map(RowArray::row_bytes).max().unwrap_or(0)
+    let arrays = row_arrays(sh_degree, [false; 2], [0; 5]);
+    arrays.iter().map(RowArray::row_bytes).max().unwrap_or(0).max(4 * GRADIENT as u64)
 }

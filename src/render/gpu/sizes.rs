@@ -5,7 +5,7 @@ use wgpu::BufferUsages;
 
 use super::exposure;
 use super::frame::{Frame, State, grid};
-use super::rows::{Content, RowArray, row_arrays};
+use super::rows::{Content, GRADIENT, RowArray, row_arrays};
 use crate::Accumulation;
 use crate::KeptPhotographs;
 use crate::cpu::BiasCorrection;
@@ -64,6 +64,22 @@ pub(super) struct PlannedBuffer {
     pub(super) usage: BufferUsages,
 }
 
+/// Name of the buffer whose [ranges](Sizes::ranges) are used one after the other.
+pub(super) const SCRATCH: &str = "scratch";
+/// Largest alignment of a range of a buffer that a device may require `[bytes]`.
+const ALIGNMENT: u64 = 256;
+
+/// A range of the buffer [`SCRATCH`], which is bound like a buffer.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct ScratchRange {
+    pub(super) name: &'static str,
+    /// Line of the ledger that it would have as a buffer.
+    pub(super) line: &'static str,
+    /// First byte in the buffer.
+    pub(super) at: u64,
+    pub(super) bytes: u64,
+}
+
 impl Sizes {
     pub(super) fn new(
         budget: RowBudget,
@@ -116,8 +132,10 @@ impl Sizes {
 
     /// Every array with an entry per row.
     pub(super) fn row_arrays(&self) -> Vec<RowArray> {
-        let [counts, masks] = [self.counts_dominant, self.with_masks].map(usize::from);
-        let others = [self.planes, self.records.stride(), counts, masks];
+        let in_slots = self.accumulation == Accumulation::Slots;
+        let [slots, counts, masks] =
+            [in_slots, self.counts_dominant, self.with_masks].map(usize::from);
+        let others = [2 * slots, self.planes, self.records.stride(), counts, masks];
         row_arrays(self.sh_degree, self.may_wait(), others)
     }
 
@@ -126,6 +144,25 @@ impl Sizes {
         let mut arrays = self.row_arrays();
         arrays.retain(|array| matches!(array.content, Content::Geometry | Content::Colour));
         arrays
+    }
+
+    /// The ranges of [`SCRATCH`]. Three uses follow each other in a step: sorting rows and entries, the loss, and the
+    /// gradients of rows between the backward pass and the optimiser.
+    pub(super) fn ranges(&self) -> Vec<ScratchRange> {
+        let range = |line, name, at, bytes: u64| {
+            let bytes = bytes.max(16).next_multiple_of(16);
+            ScratchRange { name, line, at, bytes }
+        };
+        let numbers = (4 * self.cap).next_multiple_of(ALIGNMENT);
+        let sorted = ["keys 0", "keys 1", "values"];
+        let mut all: Vec<_> = (0..)
+            .zip(sorted)
+            .map(|(i, name)| range("entries", name, i * numbers, 4 * self.cap))
+            .collect();
+        let (width, height) = self.image;
+        all.push(range("loss", "derivatives", 0, 36 * u64::from(width) * u64::from(height)));
+        all.push(range("row gradients", "gradient", 0, 4 * GRADIENT as u64 * self.trained()));
+        all
     }
 
     /// Every buffer.
@@ -143,10 +180,9 @@ impl Sizes {
             add(traits.section, traits.line, array.name, rows * array.row_bytes());
         }
         add(Section::Model, Content::Ages.traits().line, "bias", BiasCorrection::bytes());
-        for name in ["keys 0", "keys 1", "values 0", "values 1", "row of slot"] {
-            add(Section::Tiles, "entries", name, 4 * cap);
-        }
+        add(Section::Tiles, "entries", "list", 4 * cap);
         if self.accumulation == Accumulation::Slots {
+            add(Section::Tiles, "entries", "row of slot", 4 * cap);
             let bytes = 4 * self.records.stride() as u64 * cap;
             add(Section::Tiles, "gradients per entry", "records", bytes);
         }
@@ -165,7 +201,13 @@ impl Sizes {
         let channels =
             if self.alpha_and_depth { 5 } else { 3 + errors * (1 + u64::from(self.with_edges)) };
         add(Section::Renderer, "image and image gradient", "pixel gradient", 4 * channels * pixels);
-        add(Section::Renderer, "loss", "derivatives", 36 * pixels);
+        let scratch = self.ranges().iter().map(|range| range.at + range.bytes).max();
+        add(
+            Section::Renderer,
+            "scratch of sorts, loss and gradients",
+            SCRATCH,
+            scratch.unwrap_or(0),
+        );
         add(Section::Renderer, "loss", "tile sums", 8 * tiles);
         if self.with_error {
             add(Section::Renderer, "loss", "error", 4 * pixels);

@@ -23,7 +23,8 @@ impl GpuBackend {
     pub(super) fn write_at(&self, name: &str, at: u64, values: &[impl bytemuck::NoUninit]) {
         if !values.is_empty() {
             let bytes = bytemuck::cast_slice(values);
-            self.device.queue.write_buffer(self.buffers.get(name), at, bytes);
+            let (buffer, first) = self.buffers.place(name);
+            self.device.queue.write_buffer(buffer, first + at, bytes);
         }
     }
 
@@ -48,7 +49,8 @@ impl GpuBackend {
 
     pub(super) fn read(&self, name: &str, from: u64, bytes: u64) -> Result<Vec<f32>, BackendError> {
         let staging = self.buffers.get("read");
-        let bytes = readback::read(&self.device, staging, self.buffers.get(name), from, bytes)?;
+        let (buffer, first) = self.buffers.place(name);
+        let bytes = readback::read(&self.device, staging, buffer, first + from, bytes)?;
         Ok(bytemuck::pod_collect_to_vec(&bytes))
     }
 

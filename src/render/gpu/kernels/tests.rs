@@ -130,7 +130,7 @@ fn every_kernel_is_dispatched_by_its_name() {
         let found = kernels(stage, &text, &module);
         found_kernels.extend(found.into_iter().map(|kernel| base_name(&kernel.entry).to_owned()));
     }
-    for kernel in rebound().keys() {
+    for kernel in rebound(Accumulation::Slots).keys() {
         assert!(
             found_kernels.contains(*kernel),
             "`rebound` has buffers for `{kernel}`, which is no kernel"
@@ -164,7 +164,9 @@ fn every_variable_has_a_buffer() {
             }
         }
         let sizes = largest_sizes(accumulation);
-        let buffers: BTreeSet<_> = sizes.planned().into_iter().map(|p| p.name).collect();
+        let ranges = sizes.ranges().into_iter().map(|range| range.name);
+        let buffers: BTreeSet<_> =
+            sizes.planned().into_iter().map(|p| p.name).chain(ranges).collect();
         let bind = |kernel: &str, rebindings: &[Rebinding]| {
             let bindings = &found_kernels[kernel];
             for (variable, buffer) in rebindings {
