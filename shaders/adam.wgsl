@@ -1,5 +1,5 @@
 // Stage 7: Adam with a bias correction by each row's age, its number of steps; as in src/render/cpu/adam.rs.
-// The coefficients of colour come first: one kernel per band, one parameter per invocation, so that
+// The coefficients of colour come first: one kernel per band, a pair of a row's parameters per invocation, so that
 // reads are coalesced. Their gradient, the basis at the view direction times dL/dcolour, is computed
 // here and never stored. The geometry comes last, one row per invocation, together with the loss
 // terms and the noise on means that policies add (regularise.rs). Where the optimiser does not step
@@ -8,8 +8,6 @@
 @group(0) @binding(1) var<storage, read> state: State;
 // Parameters of all rows; moments and waiting gradients of the rows that are not frozen, with indices called `own`.
 @group(0) @binding(2) var<storage, read_write> params: array<f32>;
-@group(0) @binding(3) var<storage, read_write> first: array<f32>;
-@group(0) @binding(4) var<storage, read_write> second: array<f32>;
 @group(0) @binding(5) var<storage, read_write> waiting: array<f32>;
 // Each row's ages, its numbers of optimiser steps, in the halves of a word. Lower half: the age of all parameters but
 // bands 1-3; upper half: that of bands 1-3, if they have a schedule of their own.
@@ -51,13 +49,18 @@ fn take_gradient(own: u32, g: f32, steps: bool, waited: bool) -> f32 {
     return g;
 }
 
-// Applies an optimiser step to parameter `at`, whose moments are at `own`.
-fn step(at: u32, own: u32, g: f32, rate: f32, correction: vec2<f32>) {
-    let m = first[own] * BETA1 + g * (1.0 - BETA1);
-    let v = second[own] * BETA2 + g * g * (1.0 - BETA2);
-    first[own] = m;
-    second[own] = v;
-    params[at] -= m * correction.x * rate / (sqrt(v) * correction.y + EPSILON);
+// A pair of parameters after an optimiser step, whose moments it updates.
+fn stepped(
+    x: vec2<f32>,
+    g: vec2<f32>,
+    rate: vec2<f32>,
+    correction: vec2<f32>,
+    moments: ptr<function, Moments>,
+) -> vec2<f32> {
+    let m = (*moments).first * BETA1 + g * (1.0 - BETA1);
+    let v = (*moments).second * BETA2 + g * g * (1.0 - BETA2);
+    *moments = Moments(m, v);
+    return x - m * correction.x * rate / (sqrt(v) * correction.y + EPSILON);
 }
 
 // The age after one more step, which saturates, as an age has 16 bits.
@@ -93,16 +96,15 @@ fn basis_of(k: u32, d: vec3<f32>) -> f32 {
 // One band; launch.a: its first coefficient, launch.b: its number of coefficients.
 @compute @workgroup_size(256)
 fn adam_band(@builtin(global_invocation_id) id: vec3<u32>) {
-    let at = index_of(id);
+    let i = index_of(id);
     let width = 3u * launch.b;
-    let row = at / width;
+    let pairs = (width + 1u) / 2u;
+    let row = i / pairs;
     if row < frame.frozen.x || row >= frame.model.x || state.short != 0u {
         return;
     }
     let own = row - frame.frozen.x;
-    let own_at = at - frame.frozen.x * width;
-    let k = (at - row * width) / 3u;
-    let channel = (at - row * width) % 3u;
+    let j = i - row * pairs;
     let is_rest = launch.a > 0u;
     let steps = is_set(select(MAIN_STEPS, REST_STEPS, is_rest));
     let waited = is_set(select(MAIN_WAITED, REST_WAITED, is_rest));
@@ -111,10 +113,29 @@ fn adam_band(@builtin(global_invocation_id) id: vec3<u32>) {
     let age = next_age(select(ages[own] & 0xffffu, ages[own] >> 16u, has_rest_age));
     let correction = bias[min(age, MATURE)];
     let d = gradient[5u * own + 4u].xyz;
-    let g = basis_of(launch.a + k, d) * gradient[5u * own + 3u][channel];
-    let sum = take_gradient(own_at, g, steps, waited);
+    let by_colour = gradient[5u * own + 3u];
+    var g = vec2(0.0);
+    for (var p = 0u; p < 2u; p++) {
+        let number = 2u * j + p;
+        if number < width {
+            let by_number = basis_of(launch.a + number / 3u, d) * by_colour[number % 3u];
+            g[p] = take_gradient(own * width + number, by_number, steps, waited);
+        }
+    }
     if steps {
-        step(at, own_at, sum, rate, correction);
+        let at = row * width + 2u * j;
+        let has_two = 2u * j + 1u < width;
+        var x = vec2(params[at], 0.0);
+        if has_two {
+            x.y = params[at + 1u];
+        }
+        var moments = load_moments(own, width, j);
+        x = stepped(x, g, vec2(rate), correction, &moments);
+        store_moments(own, width, j, row, 11u + 3u * launch.a + 2u * j, moments);
+        params[at] = x.x;
+        if has_two {
+            params[at + 1u] = x.y;
+        }
     }
 }
 
@@ -140,15 +161,27 @@ fn adam_geometry(@builtin(global_invocation_id) id: vec3<u32>) {
             add[k] = exp_exact(params[base + k]) * frame.more_rates.w;
         }
     }
-    for (var k = 0u; k < 11u; k++) {
-        let g = gradient[5u * own + k / 4u][k % 4u] + add[k];
-        let sum = take_gradient(12u * own + k, g, steps, waited);
+    let rates = frame.rates;
+    // In pairs; the last number is padding.
+    var rate = array<vec2<f32>, 6>(
+        rates.xx, rates.xy, rates.yy, rates.zz, rates.zz, vec2(rates.w, 0.0),
+    );
+    for (var j = 0u; j < 6u; j++) {
+        var g = vec2(0.0);
+        for (var p = 0u; p < 2u; p++) {
+            let k = 2u * j + p;
+            if k < 11u {
+                let by_number = gradient[5u * own + k / 4u][k % 4u] + add[k];
+                g[p] = take_gradient(12u * own + k, by_number, steps, waited);
+            }
+        }
         if steps {
-            var rate = frame.rates.x;
-            if k >= 3u { rate = frame.rates.y; }
-            if k >= 6u { rate = frame.rates.z; }
-            if k >= 10u { rate = frame.rates.w; }
-            step(base + k, 12u * own + k, sum, rate, correction);
+            let at = base + 2u * j;
+            var moments = load_moments(own, 12u, j);
+            let x = stepped(vec2(params[at], params[at + 1u]), g, rate[j], correction, &moments);
+            store_moments(own, 12u, j, row, 2u * j, moments);
+            params[at] = x.x;
+            params[at + 1u] = x.y;
         }
     }
     var main_age = age & 0xffffu;

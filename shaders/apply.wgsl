@@ -10,10 +10,8 @@ const WORDS: u32 = 20u;
 // Any buffer with one or several numbers per row.
 @group(0) @binding(2) var<storage, read_write> buffer: array<u32>;
 // The geometry: twelve numbers per row.
-@group(0) @binding(3) var<storage, read_write> rows: array<f32>;
-@group(0) @binding(4) var<storage, read_write> sh0: array<f32>;
-@group(0) @binding(5) var<storage, read_write> first_rows: array<f32>;
-@group(0) @binding(6) var<storage, read_write> second_rows: array<f32>;
+@group(0) @binding(5) var<storage, read_write> rows: array<f32>;
+@group(0) @binding(6) var<storage, read_write> sh0: array<f32>;
 @group(0) @binding(7) var<storage, read_write> waiting_rows: array<f32>;
 @group(0) @binding(8) var<storage, read> signals: array<f32>;
 
@@ -292,10 +290,10 @@ fn clamp_opacity(@builtin(global_invocation_id) id: vec3<u32>) {
     }
     let at = 12u * row + 10u;
     rows[at] = min(rows[at], bitcast<f32>(launch.b));
-    let own = at - 12u * ops[0];
-    first_rows[own] = 0.0;
-    second_rows[own] = 0.0;
+    let own = row - ops[0];
+    // The opacity's pair; the other number is padding.
+    store_moments(own, 12u, 5u, row, 10u, Moments(vec2(0.0), vec2(0.0)));
     if launch.c != 0u {
-        waiting_rows[own] = 0.0;
+        waiting_rows[12u * own + 10u] = 0.0;
     }
 }

@@ -26,6 +26,25 @@ const BLENDED: &str = shader!("shared/blended");
 const RECORD: &str = shader!("shared/record");
 const STEPS: &str = shader!("shared/steps");
 
+/// The choices that the text of a module depends on.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub struct Formats {
+    /// How gradients are accumulated.
+    pub accumulation: Accumulation,
+    /// True if the moments of the optimiser are stored in a byte each.
+    pub moments_in_bytes: bool,
+}
+
+impl Formats {
+    /// All combinations.
+    pub fn all() -> impl Iterator<Item = Self> {
+        let of_kind = |accumulation| {
+            [false, true].map(|moments_in_bytes| Self { accumulation, moments_in_bytes })
+        };
+        Accumulation::ALL.into_iter().flat_map(of_kind)
+    }
+}
+
 /// The devices that have a stage.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum On {
@@ -35,6 +54,8 @@ enum On {
     Atomics,
     /// All devices; the invocations of a tile share splats through subgroups where these are available.
     Tiles,
+    /// All devices; steps or clears moments.
+    Moments,
     /// All devices; reads the tile lists.
     Lists,
     /// All devices; writes the tile lists.
@@ -71,9 +92,9 @@ pub const STAGES: &[Stage] = &[
     ),
     stage("project_bwd", On::All, &[VIEW, RECORD, GAUSSIAN, shader!("project_bwd")]),
     stage("mask", On::All, &[VIEW, STEPS, shader!("mask")]),
-    stage("adam", On::All, &[VIEW, RANDOM, STEPS, shader!("adam")]),
+    stage("adam", On::Moments, &[VIEW, RANDOM, STEPS, shader!("adam")]),
     stage("signals", On::All, &[VIEW, RECORD, shader!("signals")]),
-    stage("apply", On::All, &[VIEW, RANDOM, shader!("apply")]),
+    stage("apply", On::Moments, &[VIEW, RANDOM, STEPS, shader!("apply")]),
     stage("candidates", On::Lists, &[VIEW, RANDOM, shader!("candidates")]),
     stage("observe", On::Slots, &[VIEW, QUADS, BLENDED, shader!("observe")]),
     stage("observe_atomic", On::Atomics, &[VIEW, QUADS, BLENDED, shader!("observe_atomic")]),
@@ -81,10 +102,15 @@ pub const STAGES: &[Stage] = &[
 ];
 
 impl Stage {
-    /// The WGSL of the module for a device with this accumulation; `None` if the device does not have the stage.
-    pub fn text(&self, accumulation: Accumulation) -> Option<String> {
+    /// The WGSL of the module; `None` if devices with this accumulation do not have the stage.
+    pub fn text(&self, formats: Formats) -> Option<String> {
+        let Formats { accumulation, moments_in_bytes } = formats;
         let more: &[&str] = match (self.on, accumulation) {
             (On::All, _) => &[],
+            (On::Moments, _) if moments_in_bytes => {
+                &[shader!("shared/rounding"), shader!("shared/moments_both8")]
+            }
+            (On::Moments, _) => &[shader!("shared/moments_f32")],
             (On::Lists, Accumulation::Slots) => &[LIST_SLOTS],
             (On::Lists, _) => &[LIST_ROWS],
             (On::Emits, Accumulation::Slots) => &[shader!("shared/emit_slots")],

@@ -79,7 +79,7 @@ fn frozen_rows_never_change() {
         let storages = storages();
         let storages = match subject {
             Subject::Native { .. } => &storages[..],
-            Subject::Gpu(_) => &storages[..1],
+            Subject::Gpu(_) => &storages[..2],
         };
         for &storage in storages {
             for needs in [&Needs::default(), &everything] {

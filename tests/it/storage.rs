@@ -1,10 +1,10 @@
 //! Training quality if parameters and moments are stored in fewer bits. Related tests: `sameness` for reproducibility,
 //! `resuming` for checkpoints, `quarantine` for non-finite values, and `cli/memory.rs` for memory.
 
-use densify::render::Storage;
+use densify::render::{MomentStorage, Storage, Tensor, Values};
 use densify::selftest::{Setup, Subject, scenes};
 
-use crate::subject::{GREY, make, make_with, photograph, step_input, storages};
+use crate::subject::{GREY, all, make, make_with, photograph, saved, step_input, storages};
 
 /// The loss falls to a twentieth, as with f32, and then fluctuates with the rounding. Stochastic rounding keeps small
 /// steps that rounding to nearest would lose; `cpu/narrow/tests.rs` checks it number by number.
@@ -38,5 +38,51 @@ fn narrow_storage_trains_as_well_as_f32() {
     for storage in others {
         let found = loss(storage, 400);
         assert!(found <= 1.5 * reference, "{storage:?}: {first} -> {found}, not {reference}");
+    }
+}
+
+/// The bytes of an array whose name ends like this, and its bytes per row.
+fn bytes_of(state: &[Tensor], name: &str) -> (Vec<u8>, usize) {
+    let tensor = state.iter().find(|tensor| tensor.name.ends_with(name)).expect("an array");
+    let Values::U8(bytes) = &tensor.values else { panic!("{name} has no bytes") };
+    (bytes.clone(), tensor.shape[1])
+}
+
+/// Both backends round moments with the same random numbers: after a step, whose gradients differ in the last bits only,
+/// nearly all bytes are equal. With independent numbers, about half of the second moments would differ.
+#[test]
+fn moments_in_bytes_are_rounded_alike_on_all_backends() {
+    let camera = scenes::camera(64, 48, 11);
+    let model = scenes::cloud(300, 3, &camera, 12);
+    let target = scenes::target(&camera);
+    let state = |subject: &Subject| {
+        let storage = Storage { moments: MomentStorage::Both8, ..Storage::default() };
+        let mut backend = make_with(subject, &model, Setup { storage, ..Setup::default() });
+        backend.train_step(&step_input(1, &camera, &target, 3)).expect("a small image");
+        saved(&*backend).1
+    };
+    let native = state(&Subject::NATIVE);
+    let expected = ["first", "second"].map(|which| bytes_of(&native, which).0);
+    // Arrays on a device: their first parameters, and numbers of parameters.
+    let parts = [("rows", 0, 11), ("sh0", 11, 3), ("sh1", 14, 9), ("sh2", 23, 15), ("sh3", 38, 21)];
+    for subject in all().iter().filter(|subject| matches!(subject, Subject::Gpu(_))) {
+        let found = state(subject);
+        let (mut equal, mut changed) = ([0; 2], 0);
+        for (name, first, count) in parts {
+            let (bytes, width) = bytes_of(&found, &format!("moments {name}"));
+            for row in 0..model.len() {
+                for number in 0..count {
+                    let at = row * width + 2 * number;
+                    let of_cpu = expected.each_ref().map(|all| all[59 * row + first + number]);
+                    changed += usize::from(of_cpu[1] != 0);
+                    for which in 0..2 {
+                        equal[which] += usize::from(bytes[at + which] == of_cpu[which]);
+                    }
+                }
+            }
+        }
+        let most = 59 * model.len();
+        assert!(changed > most / 3, "only {changed} moments have changed");
+        assert!(equal.iter().all(|&n| n > most / 100 * 99), "{}: {equal:?}", subject.name());
     }
 }

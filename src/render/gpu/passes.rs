@@ -273,9 +273,9 @@ impl Passes<'_> {
         to.stage("adam");
         for band in 0..=usize::from(sh_degree) {
             let [first, coefficients] = [(band * band) as u32, (2 * band + 1) as u32];
-            let numbers = self.shape.rows * 3 * coefficients;
+            let pairs = self.shape.rows * (3 * coefficients).div_ceil(2);
             let immediates = [first, coefficients, 0, 0];
-            to.run(l.nth("adam_band", band), immediates, numbers.div_ceil(256));
+            to.run(l.nth("adam_band", band), immediates, pairs.div_ceil(256));
         }
         to.run(l.get("adam_geometry"), [0; 4], groups);
     }

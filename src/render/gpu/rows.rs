@@ -14,6 +14,9 @@ pub(super) const FIRST: PartNames =
     ["first rows", "first sh0", "first sh1", "first sh2", "first sh3"];
 pub(super) const SECOND: PartNames =
     ["second rows", "second sh0", "second sh1", "second sh2", "second sh3"];
+/// Both moments, if they are stored in bytes.
+pub(super) const MOMENTS: PartNames =
+    ["moments rows", "moments sh0", "moments sh1", "moments sh2", "moments sh3"];
 pub(super) const WAITING: PartNames =
     ["waiting rows", "waiting sh0", "waiting sh1", "waiting sh2", "waiting sh3"];
 
@@ -29,6 +32,8 @@ pub(super) enum Content {
     Colour,
     FirstMoments,
     SecondMoments,
+    /// Both moments of a number in two bytes; see `shaders/shared/moments_both8.wgsl`.
+    NarrowMoments,
     /// Gradients waiting for an optimiser step.
     Waiting,
     /// Number of optimiser steps, as whole numbers.
@@ -84,7 +89,7 @@ impl Content {
             Self::Colour => {
                 (Section::Model, "parameters", Inherited, false, Some(NumberKind::Parameter))
             }
-            Self::FirstMoments | Self::SecondMoments => {
+            Self::FirstMoments | Self::SecondMoments | Self::NarrowMoments => {
                 (Section::Model, "optimiser moments", Cleared, true, Some(NumberKind::Moment))
             }
             Self::Waiting => {
@@ -108,7 +113,7 @@ impl Content {
 pub(super) struct RowArray {
     /// Name of the buffer.
     pub(super) name: &'static str,
-    /// Numbers per row, of four bytes each.
+    /// Numbers per row, of four bytes each; words, if the numbers are narrower.
     pub(super) numbers: usize,
     pub(super) content: Content,
     /// The parameters that the numbers belong to; empty if they belong to none.
@@ -131,11 +136,12 @@ impl RowArray {
 }
 
 /// All arrays for models of this SH degree. `may_wait`: gradients of the geometry and band 0, and those of bands 1–3,
-/// may wait for a step. The last argument has the numbers per row of slots, signals, records, dominated pixels and
+/// may wait for a step. `moments_in_bytes`: both moments of a number take two bytes. The last argument has the numbers per row of slots, signals, records, dominated pixels and
 /// masks.
 pub(super) fn row_arrays(
     sh_degree: u8,
     may_wait: [bool; 2],
+    moments_in_bytes: bool,
     [slots, planes, fields, counts, masks]: [usize; 5],
 ) -> Vec<RowArray> {
     let geometry = 0..ModelArray::Sh.parameters(sh_degree).start;
@@ -148,6 +154,7 @@ pub(super) fn row_arrays(
         (Content::Geometry, Content::Colour, PARAMETERS),
         (Content::FirstMoments, Content::FirstMoments, FIRST),
         (Content::SecondMoments, Content::SecondMoments, SECOND),
+        (Content::NarrowMoments, Content::NarrowMoments, MOMENTS),
         (Content::Waiting, Content::Waiting, WAITING),
     ] {
         for (part, name) in names.into_iter().enumerate().take(usize::from(sh_degree) + 2) {
@@ -156,7 +163,13 @@ pub(super) fn row_arrays(
                 _ => (band(part - 1).len(), colour_content, band(part - 1)),
             };
             let (numbers, content, parameters) = array;
-            if content != Content::Waiting || may_wait[usize::from(part > 1)] {
+            let (is_used, numbers) = match content {
+                Content::Waiting => (may_wait[usize::from(part > 1)], numbers),
+                Content::FirstMoments | Content::SecondMoments => (!moments_in_bytes, numbers),
+                Content::NarrowMoments => (moments_in_bytes, numbers.div_ceil(2)),
+                _ => (true, numbers),
+            };
+            if is_used {
                 all.push(RowArray { name, numbers, content, parameters });
             }
         }
@@ -182,6 +195,6 @@ pub(super) fn row_arrays(
 
 /// Bytes per row of the widest array for models of this SH degree, for any policy.
 pub(super) fn widest_row(sh_degree: u8) -> u64 {
-    let arrays = row_arrays(sh_degree, [false; 2], [0; 5]);
+    let arrays = row_arrays(sh_degree, [false; 2], false, [0; 5]);
     arrays.iter().map(RowArray::row_bytes).max().unwrap_or(0).max(4 * GRADIENT as u64)
 }

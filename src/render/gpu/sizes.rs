@@ -7,11 +7,12 @@ use super::exposure;
 use super::frame::{Frame, State, grid};
 use super::rows::{Content, GRADIENT, RowArray, row_arrays};
 use crate::Accumulation;
-use crate::KeptPhotographs;
 use crate::cpu::BiasCorrection;
 use crate::signals::{Field, RecordLayout, SignalPlanes, counts_dominant};
+use crate::{KeptPhotographs, MomentStorage};
 use densify_core::budget::RowBudget;
 use densify_core::memory::{Ledger, Section};
+use densify_shaders::Formats;
 
 /// Number of bytes of an edit's operations that are uploaded at a time.
 pub(super) const OPS_BYTES: u64 = 1 << 18;
@@ -38,6 +39,8 @@ pub(super) struct Sizes {
     pub(super) records: RecordLayout,
     /// How gradients are accumulated; only [`Accumulation::Slots`] needs records.
     pub(super) accumulation: Accumulation,
+    /// Storage of the optimiser's moments.
+    pub(super) moments: MomentStorage,
     /// True if gradients of alpha and depth are computed too.
     pub(super) alpha_and_depth: bool,
     pub(super) cadence: Cadence,
@@ -99,6 +102,7 @@ impl Sizes {
             planes: SignalPlanes::new(needs).count,
             records,
             accumulation,
+            moments: MomentStorage::F32,
             alpha_and_depth: false,
             cadence: needs.cadence,
             counts_dominant: counts_dominant(needs),
@@ -136,7 +140,16 @@ impl Sizes {
         let [slots, counts, masks] =
             [in_slots, self.counts_dominant, self.with_masks].map(usize::from);
         let others = [2 * slots, self.planes, self.records.stride(), counts, masks];
-        row_arrays(self.sh_degree, self.may_wait(), others)
+        let Formats { moments_in_bytes, .. } = self.formats();
+        row_arrays(self.sh_degree, self.may_wait(), moments_in_bytes, others)
+    }
+
+    /// The choices that the kernels depend on.
+    pub(super) fn formats(&self) -> Formats {
+        Formats {
+            accumulation: self.accumulation,
+            moments_in_bytes: self.moments == MomentStorage::Both8,
+        }
     }
 
     /// The arrays that hold the model.
@@ -204,7 +217,7 @@ impl Sizes {
         let scratch = self.ranges().iter().map(|range| range.at + range.bytes).max();
         add(
             Section::Renderer,
-            "scratch of sorts, loss and gradients",
+            "sorts, loss, row gradients",
             SCRATCH,
             scratch.unwrap_or(0),
         );

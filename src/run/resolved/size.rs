@@ -25,9 +25,10 @@ const TILE: u32 = 16;
 const DEFAULT_IMAGE_CACHE: u64 = 1 << 30;
 /// (Row, tile) pairs per row of the budget without `--memory`.
 const PAIRS_PER_ROW: usize = 16;
-/// On a GPU, lists with more than [`PAIRS`]`[0]` pairs per row have at most this many pairs per tile of the largest image.
-/// Few views exceed that, and those are rendered in bands.
+/// On a GPU, lists with more than [`PAIRS`]`[0]` pairs per row have at most this many pairs per tile of the largest image,
+/// or [`PAIRS_OF_SMALL_IMAGE`]. Few views exceed that, and those are rendered in bands.
 const PAIRS_PER_TILE: usize = 512;
+const PAIRS_OF_SMALL_IMAGE: usize = 1 << 20;
 /// Minimum number of trained rows of a useful model, unless the user asks for fewer.
 pub(super) const MIN_ROWS: usize = 1_000;
 /// Memory in messages is rounded up to a multiple of this `[bytes]`.
@@ -153,7 +154,8 @@ impl Case<'_> {
         }
         let (width, height) = self.inputs.dataset.largest_image();
         let tiles = width.div_ceil(TILE) as usize * height.div_ceil(TILE) as usize;
-        pairs.min(rows.saturating_mul(PAIRS[0]).max(tiles.saturating_mul(PAIRS_PER_TILE)))
+        let by_tiles = tiles.saturating_mul(PAIRS_PER_TILE).max(PAIRS_OF_SMALL_IMAGE);
+        pairs.min(rows.saturating_mul(PAIRS[0]).max(by_tiles))
     }
 
     /// The budget, if it is a number.

@@ -72,7 +72,7 @@ pub static KNOBS: &[Knob] = &[
         default: "f32",
         domain: Domain::Choice(&["f32", "both8"]),
         unit: "",
-        only_on: Some(Cpu),
+        only_on: None,
         class: Bounded,
         effect: "both8: both moments of the optimiser in a byte each",
         levels: &["both8"],
