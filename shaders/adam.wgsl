@@ -6,8 +6,10 @@
 // at every iteration, gradients are summed until it does (summed.rs).
 
 @group(0) @binding(1) var<storage, read> state: State;
-// Parameters of all rows; moments and waiting gradients of the rows that are not frozen, with indices called `own`.
-@group(0) @binding(2) var<storage, read_write> params: array<f32>;
+// A band of colour of all rows, and their other parameters. Moments and waiting gradients are those of the rows that
+// are not frozen, with indices called `own`.
+@group(0) @binding(2) var<storage, read_write> params: array<Coefficient>;
+@group(0) @binding(9) var<storage, read_write> rows: array<RowPart>;
 @group(0) @binding(5) var<storage, read_write> waiting: array<f32>;
 // Each row's ages, its numbers of optimiser steps, in the halves of a word. Lower half: the age of all parameters but
 // bands 1-3; upper half: that of bands 1-3, if they have a schedule of their own.
@@ -123,19 +125,11 @@ fn adam_band(@builtin(global_invocation_id) id: vec3<u32>) {
         }
     }
     if steps {
-        let at = row * width + 2u * j;
-        let has_two = 2u * j + 1u < width;
-        var x = vec2(params[at], 0.0);
-        if has_two {
-            x.y = params[at + 1u];
-        }
+        let plane = 11u + 3u * launch.a + 2u * j;
         var moments = load_moments(own, width, j);
-        x = stepped(x, g, vec2(rate), correction, &moments);
-        store_moments(own, width, j, row, 11u + 3u * launch.a + 2u * j, moments);
-        params[at] = x.x;
-        if has_two {
-            params[at + 1u] = x.y;
-        }
+        let x = stepped(load_pair(row, width, j), g, vec2(rate), correction, &moments);
+        store_moments(own, width, j, row, plane, moments);
+        store_pair(row, width, j, plane, x);
     }
 }
 
@@ -151,18 +145,24 @@ fn adam_geometry(@builtin(global_invocation_id) id: vec3<u32>) {
     let own = row - frame.frozen.x;
     let age = ages[own];
     let correction = bias[min(next_age(age & 0xffffu), MATURE)];
-    let base = 12u * row;
+    var known = load_row(row);
     var add = array<f32, 11>();
     if is_set(TERMS) {
         // The sigmoid's derivative e^x / (1 + e^x)² is even; evaluated for x <= 0, nothing cancels.
-        let e = exp_exact(-abs(params[base + 10u]));
+        let e = exp_exact(-abs(known.logit));
         add[10] = e / ((1.0 + e) * (1.0 + e)) * frame.more_rates.z;
-        for (var k = 3u; k < 6u; k++) {
-            add[k] = exp_exact(params[base + k]) * frame.more_rates.w;
+        for (var k = 0u; k < 3u; k++) {
+            add[3u + k] = exp_exact(known.log_scale[k]) * frame.more_rates.w;
         }
     }
     let rates = frame.rates;
     // In pairs; the last number is padding.
+    let mean = known.mean;
+    let scale = known.log_scale;
+    let quat = known.quat;
+    var x = array<vec2<f32>, 6>(
+        mean.xy, vec2(mean.z, scale.x), scale.yz, quat.xy, quat.zw, vec2(known.logit, 0.0),
+    );
     var rate = array<vec2<f32>, 6>(
         rates.xx, rates.xy, rates.yy, rates.zz, rates.zz, vec2(rates.w, 0.0),
     );
@@ -176,22 +176,24 @@ fn adam_geometry(@builtin(global_invocation_id) id: vec3<u32>) {
             }
         }
         if steps {
-            let at = base + 2u * j;
             var moments = load_moments(own, 12u, j);
-            let x = stepped(vec2(params[at], params[at + 1u]), g, rate[j], correction, &moments);
+            x[j] = stepped(x[j], g, rate[j], correction, &moments);
             store_moments(own, 12u, j, row, 2u * j, moments);
-            params[at] = x.x;
-            params[at + 1u] = x.y;
         }
     }
     var main_age = age & 0xffffu;
     var rest_age = age >> 16u;
     if steps {
         main_age = next_age(main_age);
-        confine(base);
+        known.mean = vec3(x[0], x[1].x);
+        known.log_scale = vec3(x[1].y, x[2]);
+        known.quat = vec4(x[3], x[4]);
+        known.logit = x[5].x;
+        known = confined(known);
         if is_set(NOISE) {
-            add_noise(row, base);
+            known.mean += noise_of(row, known);
         }
+        store_stepped_row(row, known);
     }
     if is_set(REST_STEPS) && is_set(REST_AGES) {
         rest_age = next_age(rest_age);
@@ -199,51 +201,45 @@ fn adam_geometry(@builtin(global_invocation_id) id: vec3<u32>) {
     ages[own] = main_age | rest_age << 16u;
 }
 
-// Normalises the quaternion of a row, and clamps its scales and opacity.
-fn confine(base: u32) {
-    let q = vec4(params[base + 6u], params[base + 7u], params[base + 8u], params[base + 9u]);
-    let norm2 = dot(q, q);
+// A row with its quaternion normalised, and its scales and opacity clamped.
+fn confined(row: Row) -> Row {
+    var x = row;
+    let norm2 = dot(x.quat, x.quat);
     // A quaternion this short has lost its direction, and is reset to the identity. Here and below,
     // NaN stays NaN, so that the audit finds it.
-    var unit = q / sqrt(norm2);
     if below(norm2, 1e-12) {
-        unit = vec4(1.0, 0.0, 0.0, 0.0);
+        x.quat = vec4(1.0, 0.0, 0.0, 0.0);
+    } else if !below(norm2 - 1.0, SLACK) {
+        x.quat = x.quat / sqrt(norm2);
     }
-    for (var k = 0u; k < 4u; k++) {
-        params[base + 6u + k] = unit[k];
+    for (var k = 0u; k < 3u; k++) {
+        x.log_scale[k] = confined_to(x.log_scale[k], LOG_SCALE_LEAST, LOG_SCALE_MOST);
     }
-    for (var k = 3u; k < 6u; k++) {
-        confine_to(base + k, LOG_SCALE_LEAST, LOG_SCALE_MOST);
-    }
-    confine_to(base + 10u, -LOGIT_MAX, LOGIT_MAX);
+    x.logit = confined_to(x.logit, -LOGIT_MAX, LOGIT_MAX);
+    return x;
 }
 
-fn confine_to(at: u32, least: f32, most: f32) {
-    let x = params[at];
+fn confined_to(x: f32, least: f32, most: f32) -> f32 {
     if below(x, LARGEST) {
-        params[at] = clamp(x, least, most);
+        return clamp(x, least, most);
     }
+    return x;
 }
 
-// Adds noise to a row's mean: Δμ = R·S²·Rᵀ·ξ · share · strength. The share falls from 1 to 0 as the opacity rises.
-fn add_noise(row: u32, base: u32) {
-    let opacity = sigmoid(params[base + 10u]);
+// Noise for a row's mean: Δμ = R·S²·Rᵀ·ξ · share · strength. The share falls from 1 to 0 as the opacity rises.
+fn noise_of(row: u32, x: Row) -> vec3<f32> {
+    let opacity = sigmoid(x.logit);
     let share = 1.0 / (1.0 + exp_exact(frame.noise.y * (opacity - frame.noise.z)));
     if share < LEAST_SHARE {
-        return;
+        return vec3(0.0);
     }
     let xi = normal3(row, frame.draw.y, frame.draw.x, PURPOSE_NOISE, 0u);
-    let q = vec4(params[base + 6u], params[base + 7u], params[base + 8u], params[base + 9u]);
-    let scale = vec3(
-        exp_exact(params[base + 3u]),
-        exp_exact(params[base + 4u]),
-        exp_exact(params[base + 5u]),
-    );
-    let local = rotate(vec4(q.x, -q.yzw), xi);
-    let move_by = rotate(q, scale * scale * local) * (frame.noise.x * share);
-    if below(move_by.x, LARGEST) && below(move_by.y, LARGEST) && below(move_by.z, LARGEST) {
-        for (var k = 0u; k < 3u; k++) {
-            params[base + k] += move_by[k];
-        }
+    let s = x.log_scale;
+    let scale = vec3(exp_exact(s.x), exp_exact(s.y), exp_exact(s.z));
+    let local = rotate(vec4(x.quat.x, -x.quat.yzw), xi);
+    let noise = rotate(x.quat, scale * scale * local) * (frame.noise.x * share);
+    if below(noise.x, LARGEST) && below(noise.y, LARGEST) && below(noise.z, LARGEST) {
+        return noise;
     }
+    return vec3(0.0);
 }

@@ -45,3 +45,34 @@ fn audit_bytes(@builtin(global_invocation_id) id: vec3<u32>) {
         }
     }
 }
+
+// The same for parameters in 16 bits, two in a word. launch.b: words per row; in the geometry, seven, three numbers
+// of f32 come first and the others are in fixed point.
+@compute @workgroup_size(256)
+fn audit_halves(@builtin(global_invocation_id) id: vec3<u32>) {
+    let own = index_of(id);
+    let row = own + launch.d;
+    if row >= launch.a || marks[row] != 0u {
+        return;
+    }
+    let is_geometry = launch.b == 7u;
+    let wide = select(0u, 3u, is_geometry);
+    for (var j = 0u; j < launch.b; j++) {
+        let word = numbers[own * launch.b + j];
+        if j < wide {
+            if (word & NOT_FINITE) == NOT_FINITE {
+                marks[row] = launch.c + j + 1u;
+                return;
+            }
+            continue;
+        }
+        for (var p = 0u; p < 2u; p++) {
+            let code = (word >> (16u * p)) & 0xffffu;
+            let is_finite = select((code & 0x7c00u) != 0x7c00u, code != 0x8000u, is_geometry);
+            if !is_finite {
+                marks[row] = launch.c + wide + 2u * (j - wide) + p + 1u;
+                return;
+            }
+        }
+    }
+}

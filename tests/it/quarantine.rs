@@ -100,6 +100,8 @@ fn every_non_finite_value_is_found() {
         every_non_finite_parameter_is_found(subject, Storage::default());
         every_non_finite_moment_is_found(subject);
         if let Subject::Gpu(_) = subject {
+            let [.., smallest] = storages();
+            every_non_finite_parameter_is_found(subject, smallest);
             every_non_finite_second_moment_in_bytes_is_found(subject);
         }
     });

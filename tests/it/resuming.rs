@@ -1,6 +1,6 @@
 //! A checkpoint contains all backend state that future steps depend on.
 
-use densify::render::{Backend, MomentStorage, StepInput, Storage, Tensor, Values};
+use densify::render::{Backend, StepInput, Storage, Tensor, Values};
 use densify_policies::policy::{
     Cadence, CandidateRequest, DepthMode, ErrorMode, ErrorScore, LossTerms, MaskTerm, Needs,
     Signal, SignalSet,
@@ -102,9 +102,9 @@ fn a_restored_backend_continues_identically() {
         let setups = [(0, with_accumulation), (141, with_masks)];
         setups.map(|(frozen, needs)| (subject.clone(), (Storage::default(), frozen, needs)))
     });
-    let in_bytes = Storage { moments: MomentStorage::Both8, ..Storage::default() };
     let on_devices = devices().iter().cloned().map(Subject::Gpu);
-    let stored_on_devices = on_devices.map(|subject| (subject, (in_bytes, 0, with_accumulation)));
+    let [.., smallest] = storages();
+    let stored_on_devices = on_devices.map(|subject| (subject, (smallest, 0, with_accumulation)));
     for (subject, setup) in all.chain(stored).chain(stored_on_devices) {
         let needs = setup.2();
         let mut whole = backend(&subject, setup, &model);

@@ -19,8 +19,10 @@ pub(super) struct Buffers {
 impl Buffers {
     /// Allocates all buffers.
     pub(super) fn new(device: &Device, sizes: &Sizes) -> Result<Self, BackendError> {
-        let planned = sizes.planned();
+        let mut planned = sizes.planned();
         check_sizes(device, &planned, sizes)?;
+        // Largest first, so that small ones fill the allocator's blocks.
+        planned.sort_by_key(|planned| std::cmp::Reverse(planned.bytes));
         let total = planned.iter().map(|p| p.bytes).sum();
         let named = device.guarded("the training buffers", total, |device| {
             planned

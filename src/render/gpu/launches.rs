@@ -133,7 +133,7 @@ impl<L> Launches<L> {
             None => vec![bind(kernel, &[])],
             Some(lists) => lists.iter().map(|rebindings| bind(kernel, rebindings)).collect(),
         };
-        let of_rows = ["copy_rows", "swap_rows", "audit", "audit_bytes"];
+        let of_rows = ["copy_rows", "swap_rows", "audit", "audit_bytes", "audit_halves"];
         let is_single = |kernel: &&str| !of_rows.contains(kernel);
         Self {
             by_kernel: kernels
@@ -193,7 +193,9 @@ pub(super) fn rebound(formats: Formats) -> HashMap<&'static str, Vec<Vec<Rebindi
         }
     };
     let adam = |part: usize| {
-        [&[("params", PARAMETERS[part]), ("waiting", WAITING[part])], &moments(part)[..]].concat()
+        let params = (part > 0).then_some(("params", PARAMETERS[part]));
+        let others = [("waiting", WAITING[part])].into_iter().chain(params);
+        others.chain(moments(part)).collect()
     };
     let keys_in = two(&|i| vec![("keys in", KEYS[i])]);
     HashMap::from([
@@ -256,6 +258,7 @@ fn audits<L>(bind: Bind<'_, L>, sizes: &Sizes) -> Vec<Audit<L>> {
         let first = array.parameters.start as u32;
         let kernel = match array.content {
             Content::NarrowMoments => "audit_bytes",
+            _ if array.is_narrow => "audit_halves",
             _ => "audit",
         };
         Some(Audit {

@@ -39,7 +39,7 @@ pub(super) fn sizes(device: &Device, sh_degree: u8, options: &Setup) -> Sizes {
     let mut sizes = Sizes::new(budget, cap, sh_degree, image, &options.needs, device.accumulation);
     sizes.photographs = options.photographs;
     sizes.exposures = options.exposures;
-    sizes.moments = options.storage.moments;
+    sizes.storage = options.storage;
     // The photographs are in one buffer, which no kernel binds.
     let bytes = sizes.photograph_bytes().iter().sum::<u64>();
     let max = usize::try_from(device.summary.largest_buffer / bytes).unwrap_or(usize::MAX);

@@ -18,11 +18,15 @@ use super::super::sizes::Sizes;
 use super::*;
 use crate::Shortcuts;
 use crate::signals::RecordLayout;
-use crate::{KeptPhotographs, MomentStorage};
+use crate::{KeptPhotographs, MomentStorage, ParameterStorage};
 use densify_core::antialiasing::Antialiasing;
 use densify_shaders::{Accumulation, Formats, STAGES};
 
-const SLOTS: Formats = Formats { accumulation: Accumulation::Slots, moments_in_bytes: false };
+const SLOTS: Formats = Formats {
+    accumulation: Accumulation::Slots,
+    moments_in_bytes: false,
+    parameters_in_16_bits: false,
+};
 
 /// Capabilities that naga must allow in addition to those of every WebGPU device.
 fn capabilities(accumulation: Accumulation) -> Capabilities {
@@ -120,7 +124,10 @@ fn largest_sizes(formats: Formats) -> Sizes {
     };
     let mut sizes = Sizes::new(10.into(), 100, 3, (32, 32), &needs, formats.accumulation);
     if formats.moments_in_bytes {
-        sizes.moments = MomentStorage::Both8;
+        sizes.storage.moments = MomentStorage::Both8;
+    }
+    if formats.parameters_in_16_bits {
+        sizes.storage.parameters = ParameterStorage::F16;
     }
     sizes.photographs = KeptPhotographs { count: 1, with_masks: true };
     sizes.exposures = true;
@@ -142,8 +149,9 @@ fn every_kernel_is_dispatched_by_its_name() {
         );
     }
     // These are bound to each array of rows, not dispatched by name.
-    let mut dispatched =
-        BTreeSet::from(["copy_rows", "swap_rows", "audit", "audit_bytes"].map(str::to_owned));
+    let mut dispatched = BTreeSet::from(
+        ["copy_rows", "swap_rows", "audit", "audit_bytes", "audit_halves"].map(str::to_owned),
+    );
     let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/gpu");
     for entry in std::fs::read_dir(folder).expect("the sources") {
         let path = entry.expect("a file").path();

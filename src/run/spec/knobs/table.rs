@@ -2,7 +2,7 @@
 
 use super::Class::{Bounded, Exact};
 use super::{Domain, Knob, number};
-use densify_render::BackendKind::{Cpu, Gpu};
+use densify_render::BackendKind::Gpu;
 use densify_render::{Accumulation, MomentStorage, ParameterStorage};
 
 /// All knobs: exact ones, then bounded ones.
@@ -56,7 +56,7 @@ pub static KNOBS: &[Knob] = &[
         default: "f32",
         domain: Domain::Choice(&["f32", "f16"]),
         unit: "",
-        only_on: Some(Cpu),
+        only_on: None,
         class: Bounded,
         effect: "f16: parameters other than means in 2 bytes, rounded at random; 112 bytes less per Gaussian of degree 3",
         levels: &["f16"],

@@ -1,4 +1,4 @@
-// Random rounding of numbers that are stored in fewer bits, as in src/render/cpu/narrow/.
+// The random numbers of a step's rounding, as in src/render/cpu/narrow/.
 
 const PURPOSE_ROUND: u32 = 5u;
 
@@ -19,18 +19,4 @@ fn advanced(start: u32, steps: u32) -> u32 {
         factor *= factor;
     }
     return state;
-}
-
-// The upper `digits` random bits as a number in [0, 1).
-fn unit_of(random: u32, digits: u32) -> f32 {
-    return f32(random >> (32u - digits)) * (1.0 / f32(1u << digits));
-}
-
-// Rounds x, within ±32,767, to one of its two neighbouring integers: to the farther one if `draw` is less than the
-// distance to the nearer one.
-fn round_to_integer(x: f32, draw: f32) -> i32 {
-    let nearest = round(x);
-    let beside = x - nearest;
-    let away = select(-1, 1, beside > 0.0);
-    return i32(nearest) + select(0, away, draw < abs(beside));
 }
