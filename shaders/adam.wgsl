@@ -1,15 +1,15 @@
 // Stage 7: Adam with a bias correction by each row's age, its number of steps; as in src/render/cpu/adam.rs.
-// The coefficients of colour come first: one kernel per band, one parameter per invocation, so that
+// The coefficients of colour come first: one kernel per band, a pair of a row's parameters per invocation, so that
 // reads are coalesced. Their gradient, the basis at the view direction times dL/dcolour, is computed
 // here and never stored. The geometry comes last, one row per invocation, together with the loss
 // terms and the noise on means that policies add (regularise.rs). Where the optimiser does not step
 // at every iteration, gradients are summed until it does (summed.rs).
 
 @group(0) @binding(1) var<storage, read> state: State;
-// Parameters of all rows; moments and waiting gradients of the rows that are not frozen, with indices called `own`.
-@group(0) @binding(2) var<storage, read_write> params: array<f32>;
-@group(0) @binding(3) var<storage, read_write> first: array<f32>;
-@group(0) @binding(4) var<storage, read_write> second: array<f32>;
+// A band of colour of all rows, and their other parameters. Moments and waiting gradients are those of the rows that
+// are not frozen, with indices called `own`.
+@group(0) @binding(2) var<storage, read_write> params: array<Coefficient>;
+@group(0) @binding(9) var<storage, read_write> rows: array<RowPart>;
 @group(0) @binding(5) var<storage, read_write> waiting: array<f32>;
 // Each row's ages, its numbers of optimiser steps, in the halves of a word. Lower half: the age of all parameters but
 // bands 1-3; upper half: that of bands 1-3, if they have a schedule of their own.
@@ -51,13 +51,18 @@ fn take_gradient(own: u32, g: f32, steps: bool, waited: bool) -> f32 {
     return g;
 }
 
-// Applies an optimiser step to parameter `at`, whose moments are at `own`.
-fn step(at: u32, own: u32, g: f32, rate: f32, correction: vec2<f32>) {
-    let m = first[own] * BETA1 + g * (1.0 - BETA1);
-    let v = second[own] * BETA2 + g * g * (1.0 - BETA2);
-    first[own] = m;
-    second[own] = v;
-    params[at] -= m * correction.x * rate / (sqrt(v) * correction.y + EPSILON);
+// A pair of parameters after an optimiser step, whose moments it updates.
+fn stepped(
+    x: vec2<f32>,
+    g: vec2<f32>,
+    rate: vec2<f32>,
+    correction: vec2<f32>,
+    moments: ptr<function, Moments>,
+) -> vec2<f32> {
+    let m = (*moments).first * BETA1 + g * (1.0 - BETA1);
+    let v = (*moments).second * BETA2 + g * g * (1.0 - BETA2);
+    *moments = Moments(m, v);
+    return x - m * correction.x * rate / (sqrt(v) * correction.y + EPSILON);
 }
 
 // The age after one more step, which saturates, as an age has 16 bits.
@@ -93,16 +98,15 @@ fn basis_of(k: u32, d: vec3<f32>) -> f32 {
 // One band; launch.a: its first coefficient, launch.b: its number of coefficients.
 @compute @workgroup_size(256)
 fn adam_band(@builtin(global_invocation_id) id: vec3<u32>) {
-    let at = index_of(id);
+    let i = index_of(id);
     let width = 3u * launch.b;
-    let row = at / width;
+    let pairs = (width + 1u) / 2u;
+    let row = i / pairs;
     if row < frame.frozen.x || row >= frame.model.x || state.short != 0u {
         return;
     }
     let own = row - frame.frozen.x;
-    let own_at = at - frame.frozen.x * width;
-    let k = (at - row * width) / 3u;
-    let channel = (at - row * width) % 3u;
+    let j = i - row * pairs;
     let is_rest = launch.a > 0u;
     let steps = is_set(select(MAIN_STEPS, REST_STEPS, is_rest));
     let waited = is_set(select(MAIN_WAITED, REST_WAITED, is_rest));
@@ -111,10 +115,21 @@ fn adam_band(@builtin(global_invocation_id) id: vec3<u32>) {
     let age = next_age(select(ages[own] & 0xffffu, ages[own] >> 16u, has_rest_age));
     let correction = bias[min(age, MATURE)];
     let d = gradient[5u * own + 4u].xyz;
-    let g = basis_of(launch.a + k, d) * gradient[5u * own + 3u][channel];
-    let sum = take_gradient(own_at, g, steps, waited);
+    let by_colour = gradient[5u * own + 3u];
+    var g = vec2(0.0);
+    for (var p = 0u; p < 2u; p++) {
+        let number = 2u * j + p;
+        if number < width {
+            let by_number = basis_of(launch.a + number / 3u, d) * by_colour[number % 3u];
+            g[p] = take_gradient(own * width + number, by_number, steps, waited);
+        }
+    }
     if steps {
-        step(at, own_at, sum, rate, correction);
+        let plane = 11u + 3u * launch.a + 2u * j;
+        var moments = load_moments(own, width, j);
+        let x = stepped(load_pair(row, width, j), g, vec2(rate), correction, &moments);
+        store_moments(own, width, j, row, plane, moments);
+        store_pair(row, width, j, plane, x);
     }
 }
 
@@ -130,35 +145,55 @@ fn adam_geometry(@builtin(global_invocation_id) id: vec3<u32>) {
     let own = row - frame.frozen.x;
     let age = ages[own];
     let correction = bias[min(next_age(age & 0xffffu), MATURE)];
-    let base = 12u * row;
+    var known = load_row(row);
     var add = array<f32, 11>();
     if is_set(TERMS) {
         // The sigmoid's derivative e^x / (1 + e^x)² is even; evaluated for x <= 0, nothing cancels.
-        let e = exp_exact(-abs(params[base + 10u]));
+        let e = exp_exact(-abs(known.logit));
         add[10] = e / ((1.0 + e) * (1.0 + e)) * frame.more_rates.z;
-        for (var k = 3u; k < 6u; k++) {
-            add[k] = exp_exact(params[base + k]) * frame.more_rates.w;
+        for (var k = 0u; k < 3u; k++) {
+            add[3u + k] = exp_exact(known.log_scale[k]) * frame.more_rates.w;
         }
     }
-    for (var k = 0u; k < 11u; k++) {
-        let g = gradient[5u * own + k / 4u][k % 4u] + add[k];
-        let sum = take_gradient(12u * own + k, g, steps, waited);
+    let rates = frame.rates;
+    // In pairs; the last number is padding.
+    let mean = known.mean;
+    let scale = known.log_scale;
+    let quat = known.quat;
+    var x = array<vec2<f32>, 6>(
+        mean.xy, vec2(mean.z, scale.x), scale.yz, quat.xy, quat.zw, vec2(known.logit, 0.0),
+    );
+    var rate = array<vec2<f32>, 6>(
+        rates.xx, rates.xy, rates.yy, rates.zz, rates.zz, vec2(rates.w, 0.0),
+    );
+    for (var j = 0u; j < 6u; j++) {
+        var g = vec2(0.0);
+        for (var p = 0u; p < 2u; p++) {
+            let k = 2u * j + p;
+            if k < 11u {
+                let by_number = gradient[5u * own + k / 4u][k % 4u] + add[k];
+                g[p] = take_gradient(12u * own + k, by_number, steps, waited);
+            }
+        }
         if steps {
-            var rate = frame.rates.x;
-            if k >= 3u { rate = frame.rates.y; }
-            if k >= 6u { rate = frame.rates.z; }
-            if k >= 10u { rate = frame.rates.w; }
-            step(base + k, 12u * own + k, sum, rate, correction);
+            var moments = load_moments(own, 12u, j);
+            x[j] = stepped(x[j], g, rate[j], correction, &moments);
+            store_moments(own, 12u, j, row, 2u * j, moments);
         }
     }
     var main_age = age & 0xffffu;
     var rest_age = age >> 16u;
     if steps {
         main_age = next_age(main_age);
-        confine(base);
+        known.mean = vec3(x[0], x[1].x);
+        known.log_scale = vec3(x[1].y, x[2]);
+        known.quat = vec4(x[3], x[4]);
+        known.logit = x[5].x;
+        known = confined(known);
         if is_set(NOISE) {
-            add_noise(row, base);
+            known.mean += noise_of(row, known);
         }
+        store_stepped_row(row, known);
     }
     if is_set(REST_STEPS) && is_set(REST_AGES) {
         rest_age = next_age(rest_age);
@@ -166,51 +201,45 @@ fn adam_geometry(@builtin(global_invocation_id) id: vec3<u32>) {
     ages[own] = main_age | rest_age << 16u;
 }
 
-// Normalises the quaternion of a row, and clamps its scales and opacity.
-fn confine(base: u32) {
-    let q = vec4(params[base + 6u], params[base + 7u], params[base + 8u], params[base + 9u]);
-    let norm2 = dot(q, q);
+// A row with its quaternion normalised, and its scales and opacity clamped.
+fn confined(row: Row) -> Row {
+    var x = row;
+    let norm2 = dot(x.quat, x.quat);
     // A quaternion this short has lost its direction, and is reset to the identity. Here and below,
     // NaN stays NaN, so that the audit finds it.
-    var unit = q / sqrt(norm2);
     if below(norm2, 1e-12) {
-        unit = vec4(1.0, 0.0, 0.0, 0.0);
+        x.quat = vec4(1.0, 0.0, 0.0, 0.0);
+    } else if !below(norm2 - 1.0, SLACK) {
+        x.quat = x.quat / sqrt(norm2);
     }
-    for (var k = 0u; k < 4u; k++) {
-        params[base + 6u + k] = unit[k];
+    for (var k = 0u; k < 3u; k++) {
+        x.log_scale[k] = confined_to(x.log_scale[k], LOG_SCALE_LEAST, LOG_SCALE_MOST);
     }
-    for (var k = 3u; k < 6u; k++) {
-        confine_to(base + k, LOG_SCALE_LEAST, LOG_SCALE_MOST);
-    }
-    confine_to(base + 10u, -LOGIT_MAX, LOGIT_MAX);
+    x.logit = confined_to(x.logit, -LOGIT_MAX, LOGIT_MAX);
+    return x;
 }
 
-fn confine_to(at: u32, least: f32, most: f32) {
-    let x = params[at];
+fn confined_to(x: f32, least: f32, most: f32) -> f32 {
     if below(x, LARGEST) {
-        params[at] = clamp(x, least, most);
+        return clamp(x, least, most);
     }
+    return x;
 }
 
-// Adds noise to a row's mean: Δμ = R·S²·Rᵀ·ξ · share · strength. The share falls from 1 to 0 as the opacity rises.
-fn add_noise(row: u32, base: u32) {
-    let opacity = sigmoid(params[base + 10u]);
+// Noise for a row's mean: Δμ = R·S²·Rᵀ·ξ · share · strength. The share falls from 1 to 0 as the opacity rises.
+fn noise_of(row: u32, x: Row) -> vec3<f32> {
+    let opacity = sigmoid(x.logit);
     let share = 1.0 / (1.0 + exp_exact(frame.noise.y * (opacity - frame.noise.z)));
     if share < LEAST_SHARE {
-        return;
+        return vec3(0.0);
     }
     let xi = normal3(row, frame.draw.y, frame.draw.x, PURPOSE_NOISE, 0u);
-    let q = vec4(params[base + 6u], params[base + 7u], params[base + 8u], params[base + 9u]);
-    let scale = vec3(
-        exp_exact(params[base + 3u]),
-        exp_exact(params[base + 4u]),
-        exp_exact(params[base + 5u]),
-    );
-    let local = rotate(vec4(q.x, -q.yzw), xi);
-    let move_by = rotate(q, scale * scale * local) * (frame.noise.x * share);
-    if below(move_by.x, LARGEST) && below(move_by.y, LARGEST) && below(move_by.z, LARGEST) {
-        for (var k = 0u; k < 3u; k++) {
-            params[base + k] += move_by[k];
-        }
+    let s = x.log_scale;
+    let scale = vec3(exp_exact(s.x), exp_exact(s.y), exp_exact(s.z));
+    let local = rotate(vec4(x.quat.x, -x.quat.yzw), xi);
+    let noise = rotate(x.quat, scale * scale * local) * (frame.noise.x * share);
+    if below(noise.x, LARGEST) && below(noise.y, LARGEST) && below(noise.z, LARGEST) {
+        return noise;
     }
+    return vec3(0.0);
 }

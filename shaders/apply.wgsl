@@ -9,11 +9,8 @@ const WORDS: u32 = 20u;
 @group(0) @binding(1) var<storage, read> ops: array<u32>;
 // Any buffer with one or several numbers per row.
 @group(0) @binding(2) var<storage, read_write> buffer: array<u32>;
-// The geometry: twelve numbers per row.
-@group(0) @binding(3) var<storage, read_write> rows: array<f32>;
-@group(0) @binding(4) var<storage, read_write> sh0: array<f32>;
-@group(0) @binding(5) var<storage, read_write> first_rows: array<f32>;
-@group(0) @binding(6) var<storage, read_write> second_rows: array<f32>;
+@group(0) @binding(5) var<storage, read_write> rows: array<RowPart>;
+@group(0) @binding(6) var<storage, read_write> sh0: array<Coefficient>;
 @group(0) @binding(7) var<storage, read_write> waiting_rows: array<f32>;
 @group(0) @binding(8) var<storage, read> signals: array<f32>;
 
@@ -141,18 +138,6 @@ fn product(a: vec4<f32>, b: vec4<f32>) -> vec4<f32> {
     return vec4(a.x * b.x - dot(a.yzw, b.yzw), a.x * b.yzw + b.x * a.yzw + cross(a.yzw, b.yzw));
 }
 
-fn put(row: u32, mean: vec3<f32>, log_scale: vec3<f32>, quat: vec4<f32>, logit: f32) {
-    let base = 12u * row;
-    for (var k = 0u; k < 3u; k++) {
-        rows[base + k] = mean[k];
-        rows[base + 3u + k] = log_scale[k];
-    }
-    for (var k = 0u; k < 4u; k++) {
-        rows[base + 6u + k] = quat[k];
-    }
-    rows[base + 10u] = logit;
-}
-
 // Writes families; launch.a: their number, launch.b: seed, launch.c: step. Words of an operation: parent; index in
 // `ops` of the first child's row; number of children; index of the first child in its family; 1 if the
 // parent is overwritten by child 0; placement (0: offset, 1: sampled, 2: along the longest axis,
@@ -166,21 +151,21 @@ fn breed(@builtin(global_invocation_id) id: vec3<u32>) {
     }
     let op = i * WORDS;
     let parent = ops[op];
-    let base = 12u * parent;
-    let mean = vec3(rows[base], rows[base + 1u], rows[base + 2u]);
-    let log_scale = vec3(rows[base + 3u], rows[base + 4u], rows[base + 5u]);
-    let quat = vec4(rows[base + 6u], rows[base + 7u], rows[base + 8u], rows[base + 9u]);
+    let known = load_row(parent);
+    let mean = known.mean;
+    let log_scale = known.log_scale;
+    let quat = known.quat;
     let scales = scales_of(log_scale, op + 9u);
-    let logit = logit_after(rows[base + 10u], ops[op + 13u], real(op + 14u));
+    let logit = logit_after(known.logit, ops[op + 13u], real(op + 14u));
     let turned = product(quat, quaternion_at(op + 15u));
     let children = ops[op + 2u];
     for (var k = 0u; k < children; k++) {
         let at = mean + offset_of(op, ops[op + 3u] + k, parent, log_scale, quat);
-        put(ops[ops[op + 1u] + k], at, scales, turned, logit);
+        store_row(ops[ops[op + 1u] + k], Row(at, scales, turned, logit));
     }
     if ops[op + 4u] != 0u {
         let at = mean + offset_of(op, 0u, parent, log_scale, quat);
-        put(parent, at, scales, turned, logit);
+        store_row(parent, Row(at, scales, turned, logit));
     }
 }
 
@@ -220,19 +205,17 @@ fn rewrite(@builtin(global_invocation_id) id: vec3<u32>) {
         return;
     }
     let op = i * WORDS;
-    let base = 12u * ops[op];
-    let log_scale = vec3(rows[base + 3u], rows[base + 4u], rows[base + 5u]);
-    let scales = scales_of(log_scale, op + 1u);
-    for (var k = 0u; k < 3u; k++) {
-        rows[base + 3u + k] = scales[k];
-        if ops[op + 7u] != 0u {
-            rows[base + k] = real(op + 8u + k);
-        }
-        if ops[op + 11u] != 0u {
-            sh0[3u * ops[op] + k] = real(op + 12u + k);
-        }
+    let row = ops[op];
+    var known = load_row(row);
+    known.log_scale = scales_of(known.log_scale, op + 1u);
+    if ops[op + 7u] != 0u {
+        known.mean = vec3(real(op + 8u), real(op + 9u), real(op + 10u));
     }
-    rows[base + 10u] = logit_after(rows[base + 10u], ops[op + 5u], real(op + 6u));
+    if ops[op + 11u] != 0u {
+        store_band0(row, vec3(real(op + 12u), real(op + 13u), real(op + 14u)));
+    }
+    known.logit = logit_after(known.logit, ops[op + 5u], real(op + 6u));
+    store_row(row, known);
 }
 
 // Writes seeds; launch.a: their number. Words of an operation: row; mean; log-scales; quaternion; logit; three
@@ -247,10 +230,8 @@ fn sow(@builtin(global_invocation_id) id: vec3<u32>) {
     let row = ops[op];
     let mean = vec3(real(op + 1u), real(op + 2u), real(op + 3u));
     let log_scale = vec3(real(op + 4u), real(op + 5u), real(op + 6u));
-    put(row, mean, log_scale, quaternion_at(op + 7u), real(op + 11u));
-    for (var k = 0u; k < 3u; k++) {
-        sh0[3u * row + k] = real(op + 12u + k);
-    }
+    store_row(row, Row(mean, log_scale, quaternion_at(op + 7u), real(op + 11u)));
+    store_band0(row, vec3(real(op + 12u), real(op + 13u), real(op + 14u)));
 }
 
 // Opacities do not decay below this.
@@ -269,17 +250,16 @@ fn decay(@builtin(global_invocation_id) id: vec3<u32>) {
         return;
     }
     let decrease = bitcast<f32>(launch.b);
-    let base = 12u * row;
-    let logit = rows[base + 10u];
+    var known = load_row(row);
+    let logit = known.logit;
     // Values that are not finite are left for the audit to find.
     if decrease > 0.0 && below(logit, LARGEST) {
         let opacity = sigmoid(logit);
         let left = max(opacity - decrease, OPACITY_LEAST);
-        rows[base + 10u] = min(logit, logit_of(left, sigmoid(-logit) + (opacity - left)));
+        known.logit = min(logit, logit_of(left, sigmoid(-logit) + (opacity - left)));
     }
-    for (var k = 0u; k < 3u; k++) {
-        rows[base + 3u + k] += bitcast<f32>(launch.c);
-    }
+    known.log_scale += bitcast<f32>(launch.c);
+    store_row(row, known);
 }
 
 // Caps all opacities and clears their moments; launch.a: number of rows, launch.b: bits of the largest logit,
@@ -290,12 +270,13 @@ fn clamp_opacity(@builtin(global_invocation_id) id: vec3<u32>) {
     if row < ops[0] || row >= launch.a {
         return;
     }
-    let at = 12u * row + 10u;
-    rows[at] = min(rows[at], bitcast<f32>(launch.b));
-    let own = at - 12u * ops[0];
-    first_rows[own] = 0.0;
-    second_rows[own] = 0.0;
+    var known = load_row(row);
+    known.logit = min(known.logit, bitcast<f32>(launch.b));
+    store_row(row, known);
+    let own = row - ops[0];
+    // The opacity's pair; the other number is padding.
+    store_moments(own, 12u, 5u, row, 10u, Moments(vec2(0.0), vec2(0.0)));
     if launch.c != 0u {
-        waiting_rows[own] = 0.0;
+        waiting_rows[12u * own + 10u] = 0.0;
     }
 }

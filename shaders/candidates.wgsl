@@ -2,11 +2,9 @@
 // errors; see src/render/cpu/candidates.rs.
 
 @group(0) @binding(1) var<storage, read> state: State;
-@group(0) @binding(2) var<storage, read> list: array<u32>;
-@group(0) @binding(3) var<storage, read> row_of_slot: array<u32>;
 @group(0) @binding(4) var<storage, read> tile_starts: array<u32>;
 @group(0) @binding(5) var<storage, read> splats: array<vec4<f32>>;
-@group(0) @binding(6) var<storage, read> rows: array<f32>;
+@group(0) @binding(6) var<storage, read> rows: array<RowPart>;
 // Indices of the pixels.
 @group(0) @binding(7) var<storage, read> pixels: array<u32>;
 // Surface points, with their depths; depth 0: no surface.
@@ -40,7 +38,7 @@ fn surface_row(tile: u32, at: vec2<f32>, is_median: bool) -> u32 {
     var best = NONE;
     var most = 0.0;
     for (var k = tile_starts[tile]; k < tile_starts[tile + 1u]; k++) {
-        let row = row_of_slot[list[k]];
+        let row = row_at(k);
         let a = splats[3u * row];
         let b = splats[3u * row + 1u];
         let d = at - a.xy;
@@ -73,14 +71,11 @@ fn closest_approach(row: u32, at: vec2<f32>) -> vec4<f32> {
     let ratio = (at - frame.lens.zw) / frame.lens.xy;
     // This vector has camera z = 1, so the parameter along the ray is the depth.
     let ray = frame.rotation[0].xyz * ratio.x + frame.rotation[1].xyz * ratio.y + frame.rotation[2].xyz;
-    let base = 12u * row;
-    let mean = vec3(rows[base], rows[base + 1u], rows[base + 2u]);
-    let scale = vec3(
-        exp_exact(rows[base + 3u]),
-        exp_exact(rows[base + 4u]),
-        exp_exact(rows[base + 5u]),
-    );
-    let back = vec4(rows[base + 6u], -rows[base + 7u], -rows[base + 8u], -rows[base + 9u]);
+    let known = load_row(row);
+    let mean = known.mean;
+    let s = known.log_scale;
+    let scale = vec3(exp_exact(s.x), exp_exact(s.y), exp_exact(s.z));
+    let back = vec4(known.quat.x, -known.quat.yzw);
     let direction = rotate(back, ray) / scale;
     let offset = rotate(back, frame.centre.xyz - mean) / scale;
     let depth = -dot(direction, offset) / dot(direction, direction);

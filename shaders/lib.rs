@@ -14,6 +14,8 @@ macro_rules! shader {
 const VIEW: &str = shader!("shared/view");
 const GAUSSIAN: &str = shader!("shared/gaussian");
 const RANDOM: &str = shader!("shared/random");
+const LIST_ROWS: &str = shader!("shared/list_rows");
+const LIST_SLOTS: &str = shader!("shared/list_slots");
 const QUADS: &str = shader!("shared/quads");
 const BATCH: &str = shader!("shared/batch");
 const SLOTS: &str = shader!("shared/slots");
@@ -23,6 +25,77 @@ const BACKWARD: &str = shader!("shared/backward");
 const BLENDED: &str = shader!("shared/blended");
 const RECORD: &str = shader!("shared/record");
 const STEPS: &str = shader!("shared/steps");
+const ROW: &str = shader!("shared/row");
+const NARROW: &str = shader!("shared/narrow");
+const DRAWS: &str = shader!("shared/draws");
+
+/// The choices that the text of a module depends on.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub struct Formats {
+    /// How gradients are accumulated.
+    pub accumulation: Accumulation,
+    /// True if the moments of the optimiser are stored in a byte each.
+    pub moments_in_bytes: bool,
+    /// True if parameters but means are stored in 16 bits.
+    pub parameters_in_16_bits: bool,
+}
+
+impl Formats {
+    /// All combinations.
+    pub fn all() -> impl Iterator<Item = Self> {
+        let of_kind = |accumulation| {
+            [(false, false), (true, false), (false, true), (true, true)].map(
+                |(moments_in_bytes, parameters_in_16_bits)| Self {
+                    accumulation,
+                    moments_in_bytes,
+                    parameters_in_16_bits,
+                },
+            )
+        };
+        Accumulation::ALL.into_iter().flat_map(of_kind)
+    }
+}
+
+/// The numbers that a module accesses, whose format is chosen for a run.
+#[derive(Debug, Clone, Copy)]
+enum Numbers {
+    /// Reads rows.
+    Rows,
+    /// Writes rows.
+    StoreRows,
+    /// Steps rows and coefficients of colour.
+    Steps,
+    /// Reads coefficients of colour.
+    Colours,
+    /// Writes band 0 of colour.
+    Band0,
+    /// Steps or clears moments.
+    Moments,
+}
+
+impl Numbers {
+    /// The texts for these formats.
+    fn texts(self, formats: Formats) -> &'static [&'static str] {
+        let is_narrow = match self {
+            Self::Moments => formats.moments_in_bytes,
+            _ => formats.parameters_in_16_bits,
+        };
+        match (self, is_narrow) {
+            (Self::Rows, false) => &[ROW, shader!("shared/rows_f32")],
+            (Self::Rows, true) => &[ROW, NARROW, shader!("shared/rows_f16")],
+            (Self::StoreRows, false) => &[shader!("shared/store_f32")],
+            (Self::StoreRows, true) => &[shader!("shared/store_f16")],
+            (Self::Steps, false) => &[shader!("shared/step_f32")],
+            (Self::Steps, true) => &[DRAWS, shader!("shared/step_f16")],
+            (Self::Colours, false) => &[shader!("shared/colours_f32")],
+            (Self::Colours, true) => &[NARROW, shader!("shared/colours_f16")],
+            (Self::Band0, false) => &[shader!("shared/band0_f32")],
+            (Self::Band0, true) => &[NARROW, shader!("shared/band0_f16")],
+            (Self::Moments, false) => &[shader!("shared/moments_f32")],
+            (Self::Moments, true) => &[NARROW, DRAWS, shader!("shared/moments_both8")],
+        }
+    }
+}
 
 /// The devices that have a stage.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -33,6 +106,10 @@ enum On {
     Atomics,
     /// All devices; the invocations of a tile share splats through subgroups where these are available.
     Tiles,
+    /// All devices; reads the tile lists.
+    Lists,
+    /// All devices; writes the tile lists.
+    Emits,
     /// All devices.
     All,
 }
@@ -44,16 +121,24 @@ pub struct Stage {
     pub name: &'static str,
     on: On,
     texts: &'static [&'static str],
+    numbers: &'static [Numbers],
+}
+
+impl Stage {
+    const fn with(self, numbers: &'static [Numbers]) -> Self {
+        Self { numbers, ..self }
+    }
 }
 
 const fn stage(name: &'static str, on: On, texts: &'static [&'static str]) -> Stage {
-    Stage { name, on, texts }
+    Stage { name, on, texts, numbers: &[] }
 }
 
 /// All stages. [`Stage::text`] adds the texts that depend on the device.
 pub const STAGES: &[Stage] = &[
-    stage("project", On::All, &[VIEW, GAUSSIAN, shader!("project")]),
-    stage("tiles", On::All, &[VIEW, shader!("tiles")]),
+    stage("project", On::All, &[VIEW, GAUSSIAN, shader!("project")])
+        .with(&[Numbers::Rows, Numbers::Colours]),
+    stage("tiles", On::Emits, &[VIEW, shader!("tiles")]),
     stage("rasterize", On::Tiles, &[VIEW, QUADS, shader!("rasterize")]),
     stage("exposure", On::All, &[VIEW, shader!("exposure")]),
     stage("loss", On::All, &[VIEW, shader!("loss")]),
@@ -63,33 +148,57 @@ pub const STAGES: &[Stage] = &[
         On::Atomics,
         &[VIEW, RECORD, QUADS, BACKWARD, shader!("rasterize_bwd_atomic")],
     ),
-    stage("project_bwd", On::All, &[VIEW, RECORD, GAUSSIAN, shader!("project_bwd")]),
-    stage("mask", On::All, &[VIEW, STEPS, shader!("mask")]),
-    stage("adam", On::All, &[VIEW, RANDOM, STEPS, shader!("adam")]),
-    stage("signals", On::All, &[VIEW, RECORD, shader!("signals")]),
-    stage("apply", On::All, &[VIEW, RANDOM, shader!("apply")]),
-    stage("candidates", On::All, &[VIEW, RANDOM, shader!("candidates")]),
+    stage("project_bwd", On::All, &[VIEW, RECORD, GAUSSIAN, shader!("project_bwd")])
+        .with(&[Numbers::Rows, Numbers::Colours]),
+    stage("mask", On::All, &[VIEW, STEPS, shader!("mask")])
+        .with(&[Numbers::Rows, Numbers::StoreRows]),
+    stage("adam", On::All, &[VIEW, RANDOM, STEPS, shader!("adam")]).with(&[
+        Numbers::Rows,
+        Numbers::StoreRows,
+        Numbers::Steps,
+        Numbers::Moments,
+    ]),
+    stage("signals", On::All, &[VIEW, RECORD, shader!("signals")]).with(&[Numbers::Rows]),
+    stage("apply", On::All, &[VIEW, RANDOM, STEPS, shader!("apply")]).with(&[
+        Numbers::Rows,
+        Numbers::StoreRows,
+        Numbers::Band0,
+        Numbers::Moments,
+    ]),
+    stage("candidates", On::Lists, &[VIEW, RANDOM, shader!("candidates")]).with(&[Numbers::Rows]),
     stage("observe", On::Slots, &[VIEW, QUADS, BLENDED, shader!("observe")]),
     stage("observe_atomic", On::Atomics, &[VIEW, QUADS, BLENDED, shader!("observe_atomic")]),
     stage("audit", On::All, &[VIEW, shader!("audit")]),
 ];
 
 impl Stage {
-    /// The WGSL of the module for a device with this accumulation; `None` if the device does not have the stage.
-    pub fn text(&self, accumulation: Accumulation) -> Option<String> {
+    /// The WGSL of the module; `None` if devices with this accumulation do not have the stage.
+    pub fn text(&self, formats: Formats) -> Option<String> {
+        let accumulation = formats.accumulation;
         let more: &[&str] = match (self.on, accumulation) {
             (On::All, _) => &[],
-            (On::Tiles, Accumulation::Slots) => &[BATCH],
-            (On::Tiles, _) => &[SUBGROUPS],
-            (On::Slots, Accumulation::Slots) => &[BATCH, SLOTS],
+            (On::Lists, Accumulation::Slots) => &[LIST_SLOTS],
+            (On::Lists, _) => &[LIST_ROWS],
+            (On::Emits, Accumulation::Slots) => &[shader!("shared/emit_slots")],
+            (On::Emits, _) => &[shader!("shared/emit_rows")],
+            (On::Tiles, Accumulation::Slots) => &[LIST_SLOTS, BATCH],
+            (On::Tiles, _) => &[LIST_ROWS, SUBGROUPS],
+            (On::Slots, Accumulation::Slots) => &[LIST_SLOTS, BATCH, SLOTS],
             (On::Atomics, Accumulation::SubgroupCas) => {
-                &[SUBGROUPS, ATOMICS, shader!("shared/sums_cas")]
+                &[LIST_ROWS, SUBGROUPS, ATOMICS, shader!("shared/sums_cas")]
             }
             (On::Atomics, Accumulation::SubgroupAtomics) => {
-                &[SUBGROUPS, ATOMICS, shader!("shared/sums_f32")]
+                &[LIST_ROWS, SUBGROUPS, ATOMICS, shader!("shared/sums_f32")]
             }
             (On::Slots, _) | (On::Atomics, Accumulation::Slots) => return None,
         };
-        Some([self.texts, more].concat().concat())
+        let mut all = [self.texts, more].concat();
+        for text in self.numbers.iter().flat_map(|numbers| numbers.texts(formats)) {
+            // Several accesses may need the same file.
+            if !all.contains(text) {
+                all.push(text);
+            }
+        }
+        Some(all.concat())
     }
 }

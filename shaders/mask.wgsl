@@ -2,8 +2,7 @@
 // src/render/cpu/mask.rs. One row per invocation, before the geometry steps.
 
 @group(0) @binding(1) var<storage, read> state: State;
-// The geometry: twelve numbers per row.
-@group(0) @binding(2) var<storage, read_write> rows: array<f32>;
+@group(0) @binding(2) var<storage, read_write> rows: array<RowPart>;
 // Change of each mask's logit since its start; then the logit's two moments.
 @group(0) @binding(3) var<storage, read_write> mask_offsets: array<f32>;
 @group(0) @binding(4) var<storage, read_write> mask_moments: array<f32>;
@@ -22,10 +21,10 @@ fn step_masks(@builtin(global_invocation_id) id: vec3<u32>) {
     }
     let own = row - frame.frozen.x;
     let start = bitcast<f32>(launch.a);
-    let opacity_at = 12u * row + 10u;
+    var known = load_row(row);
     let g_opacity = gradient[5u * own + 2u].z;
     let g_scales = gradient[5u * own].w + gradient[5u * own + 1u].x + gradient[5u * own + 1u].y;
-    let by_factor = g_opacity / sigmoid(-rows[opacity_at]) + g_scales;
+    let by_factor = g_opacity / sigmoid(-known.logit) + g_scales;
     let m = start + mask_offsets[own];
     let g = (by_factor + bitcast<f32>(launch.c)) * sigmoid(m) * sigmoid(-m);
     let first = mask_moments[2u * own] * BETA1 + g * (1.0 - BETA1);
@@ -36,6 +35,7 @@ fn step_masks(@builtin(global_invocation_id) id: vec3<u32>) {
     mask_moments[2u * own] = first;
     mask_moments[2u * own + 1u] = second;
     if start + mask_offsets[own] <= bitcast<f32>(launch.d) {
-        rows[opacity_at] = -LOGIT_MAX;
+        known.logit = -LOGIT_MAX;
+        store_row(row, known);
     }
 }

@@ -49,7 +49,7 @@ fn replay_atomic(
         }
         let count = min(m.members, end - first);
         if m.place < count {
-            load_splat(m.place, row_of_slot[list[first + m.place]], quad.corner);
+            load_splat(m.place, row_at(first + m.place), quad.corner);
         }
         // Four splats per round, unrolled by hand as in rasterize_bwd_atomic.wgsl.
         var i = 0u;

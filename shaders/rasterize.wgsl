@@ -78,7 +78,7 @@ fn rasterize(
         }
         let count = min(m.members, end - first);
         if m.place < count {
-            load_splat(m.place, row_of_slot[list[first + m.place]], quad.corner);
+            load_splat(m.place, row_at(first + m.place), quad.corner);
         }
         wait_for_all();
         // Four splats per round, unrolled by hand: compilers do not unroll a body of this size, and the number
@@ -102,7 +102,7 @@ fn rasterize(
             canvas[to] = vec4(red[p], green[p], blue[p], accumulated.depth[p]);
             finish[to] = vec2(bitcast<u32>(pixels.light[p]), accumulated.stop[p]);
             if COUNTS_DOMINANT && accumulated.most[p] > 0.0 {
-                atomicAdd(&dominant[row_of_slot[list[begin + accumulated.most_at[p]]]], 1u);
+                atomicAdd(&dominant[row_at(begin + accumulated.most_at[p])], 1u);
             }
         }
     }

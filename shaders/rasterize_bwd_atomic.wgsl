@@ -42,7 +42,7 @@ fn rasterize_bwd_atomic(
         let first = (batches - 1u - n) * m.members;
         let count = min(m.members, reached - first);
         if m.place < count {
-            load_splat(m.place, row_of_slot[list[begin + first + m.place]], quad.corner);
+            load_splat(m.place, row_at(begin + first + m.place), quad.corner);
         }
         // A subgroup covers only a part of the tile, and many of the tile's splats do not reach that part.
         let seen = subgroupBallot(m.place < count && may_reach(own_splat, block));

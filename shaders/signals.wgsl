@@ -8,7 +8,7 @@
 @group(0) @binding(4) var<storage, read> row_sums: array<f32>;
 @group(0) @binding(5) var<storage, read> depths: array<u32>;
 @group(0) @binding(6) var<storage, read> splats: array<vec4<f32>>;
-@group(0) @binding(7) var<storage, read> rows: array<f32>;
+@group(0) @binding(7) var<storage, read> rows: array<RowPart>;
 @group(0) @binding(8) var<storage, read> ages: array<u32>;
 // Number of pixels that each row dominates, if they are counted.
 @group(0) @binding(9) var<storage, read> dominant: array<u32>;
@@ -167,11 +167,11 @@ fn present(@builtin(global_invocation_id) id: vec3<u32>) {
         return;
     }
     let own = row - launch.d;
-    let s = vec3(rows[12u * row + 3u], rows[12u * row + 4u], rows[12u * row + 5u]);
-    let logit = rows[12u * row + 10u];
+    let known = load_row(row);
+    let s = known.log_scale;
     var value = 0.0;
     if launch.a == OPACITY {
-        value = sigmoid(logit);
+        value = sigmoid(known.logit);
     } else if launch.a == MASK {
         value = sigmoid(bitcast<f32>(launch.c) + mask_offsets[own]);
     } else if launch.a == SCALE_MAX {

@@ -3,8 +3,9 @@
 // list is then sorted by depth, and by row where depths are equal. project.wgsl has stored each row's
 // footprint in integers, so counting entries and emitting them cannot disagree.
 //
-// Prefix sums and sorts are exact and have a fixed order: no result depends on timing. An entry's index
-// before the sort is its slot: the slots of a row are contiguous, in the order of its tiles.
+// Prefix sums and sorts are exact and have a fixed order: no result depends on timing. Lists hold rows; if gradients
+// are accumulated in slots, they hold slots instead. An entry's slot is its index before the sort: the slots of a row
+// are contiguous, in the order of its tiles.
 //
 // One file, because counting, emitting and sorting share the state and the counters.
 
@@ -13,8 +14,9 @@
 @group(0) @binding(2) var<storage, read_write> groups: array<u32>;
 @group(0) @binding(3) var<storage, read> depths: array<u32>;
 @group(0) @binding(4) var<storage, read> footprints: array<vec4<u32>>;
-@group(0) @binding(5) var<storage, read> keys_in: array<u32>;
-@group(0) @binding(6) var<storage, read> values_in: array<u32>;
+// Only read. Writable, because they may be ranges of the buffer that keys_out and values_out are in.
+@group(0) @binding(5) var<storage, read_write> keys_in: array<u32>;
+@group(0) @binding(6) var<storage, read_write> values_in: array<u32>;
 @group(0) @binding(7) var<storage, read_write> keys_out: array<u32>;
 @group(0) @binding(8) var<storage, read_write> values_out: array<u32>;
 // Numbers to sum, then their prefix sums within their block of 2,048.
@@ -23,11 +25,8 @@
 @group(0) @binding(10) var<storage, read_write> block_sums: array<u32>;
 // Rows on screen, front to back.
 @group(0) @binding(11) var<storage, read> order: array<u32>;
-@group(0) @binding(12) var<storage, read_write> row_of_slot: array<u32>;
-// First slot and number of slots of each row.
-@group(0) @binding(13) var<storage, read_write> slots_of_row: array<vec2<u32>>;
-@group(0) @binding(14) var<storage, read_write> tile_starts: array<u32>;
-@group(0) @binding(15) var<storage, read_write> tile_counts: array<atomic<u32>>;
+@group(0) @binding(13) var<storage, read_write> tile_starts: array<u32>;
+@group(0) @binding(14) var<storage, read_write> tile_counts: array<atomic<u32>>;
 
 // Items per workgroup and per invocation in prefix sums and sorts.
 const BLOCK: u32 = 2048u;
@@ -285,14 +284,14 @@ fn count_entries(@builtin(global_invocation_id) id: vec3<u32>) {
     sums[i] = min(count, MOST);
 }
 
-// Writes the entries: the tile and row of each slot, and the slots of each row.
+// Writes the entries, row by row: the tile and row of each.
 @compute @workgroup_size(256)
 fn emit_entries(@builtin(global_invocation_id) id: vec3<u32>) {
     let i = index_of(id);
     // The lists stay empty if the entries do not fit.
     if i >= state.visible || state.held == 0u {
         if i < state.visible {
-            slots_of_row[order[i]] = vec2(0u, 0u);
+            store_slots(order[i], 0u, 0u);
         }
         return;
     }
@@ -311,12 +310,12 @@ fn emit_entries(@builtin(global_invocation_id) id: vec3<u32>) {
             let run = run_of(f.x & 0xffffu, f.x >> 16u, f.w & 0xffffu, bit, before, tiles.x, tiles.y);
             for (var x = run.first; x <= run.last; x++) {
                 keys_out[slot] = before + x;
-                row_of_slot[slot] = row;
+                values_out[slot] = row;
                 slot++;
             }
         }
     }
-    slots_of_row[row] = vec2(first_slot, slot - first_slot);
+    store_slots(row, first_slot, slot - first_slot);
 }
 
 // --- Bands --------------------------------------------------------------------------------------

@@ -1,11 +1,11 @@
 // A row's projection and colour, for the forward and the backward pass: the functions of
 // src/render/cpu/project.rs, which derives the formulas.
 
-@group(0) @binding(1) var<storage, read> rows: array<vec4<f32>>;
-@group(0) @binding(2) var<storage, read> sh0: array<f32>;
-@group(0) @binding(3) var<storage, read> sh1: array<f32>;
-@group(0) @binding(4) var<storage, read> sh2: array<f32>;
-@group(0) @binding(5) var<storage, read> sh3: array<f32>;
+@group(0) @binding(1) var<storage, read> rows: array<RowPart>;
+@group(0) @binding(2) var<storage, read> sh0: array<Coefficient>;
+@group(0) @binding(3) var<storage, read> sh1: array<Coefficient>;
+@group(0) @binding(4) var<storage, read> sh2: array<Coefficient>;
+@group(0) @binding(5) var<storage, read> sh3: array<Coefficient>;
 
 // Variance added to both diagonal entries of a projected covariance [px²]; with antialiasing, the kernel.
 override BLUR: f32 = 0.3;
@@ -14,21 +14,6 @@ override LOWERS_OPACITY: bool = false;
 // √(½·log₂ e): the conic factors of splats are scaled by this, so that exp becomes exp2.
 const EXPONENT_SCALE: f32 = 0.8493218;
 const COLOUR_MAX: f32 = 1e6;
-
-struct Row {
-    mean: vec3<f32>,
-    log_scale: vec3<f32>,
-    // w, x, y, z.
-    quat: vec4<f32>,
-    logit: f32,
-}
-
-fn load_row(row: u32) -> Row {
-    let a = rows[3u * row];
-    let b = rows[3u * row + 1u];
-    let c = rows[3u * row + 2u];
-    return Row(a.xyz, vec3(a.w, b.x, b.y), vec4(b.z, b.w, c.x, c.y), c.z);
-}
 
 // log2 of x in [1, 2]; absolute error below 3e-7.
 fn log2_of_1_to_2(x: f32) -> f32 {
@@ -187,24 +172,6 @@ fn basis(degree: u32, d: vec3<f32>) -> array<f32, 16> {
         y[15] = C30 * d.x * (xx - 3.0 * yy);
     }
     return y;
-}
-
-// Coefficient k of all three channels.
-fn coefficient(row: u32, k: u32) -> vec3<f32> {
-    if k == 0u {
-        let at = 3u * row;
-        return vec3(sh0[at], sh0[at + 1u], sh0[at + 2u]);
-    }
-    if k < 4u {
-        let at = 9u * row + 3u * (k - 1u);
-        return vec3(sh1[at], sh1[at + 1u], sh1[at + 2u]);
-    }
-    if k < 9u {
-        let at = 15u * row + 3u * (k - 4u);
-        return vec3(sh2[at], sh2[at + 1u], sh2[at + 2u]);
-    }
-    let at = 21u * row + 3u * (k - 9u);
-    return vec3(sh3[at], sh3[at + 1u], sh3[at + 2u]);
 }
 
 // 1/2 + the sum of Y_k·sh_k per channel, before the clamp at 0.

@@ -5,9 +5,6 @@
 // splat is read once for all four, and their contributions to its sums are added in registers.
 
 @group(0) @binding(1) var<storage, read_write> state: State;
-// Slots sorted by tile, then front to back.
-@group(0) @binding(2) var<storage, read> list: array<u32>;
-@group(0) @binding(3) var<storage, read> row_of_slot: array<u32>;
 @group(0) @binding(4) var<storage, read> tile_starts: array<u32>;
 @group(0) @binding(5) var<storage, read> splats: array<vec4<f32>>;
 

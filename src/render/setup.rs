@@ -27,7 +27,7 @@ pub struct Setup {
     pub largest_image: (u32, u32),
     /// Photographs kept in GPU memory instead of being uploaded at every step.
     pub photographs: KeptPhotographs,
-    /// Storage formats of parameters and moments (native backend).
+    /// Storage formats of parameters and moments.
     pub storage: Storage,
     /// Thresholds of blending.
     pub shortcuts: Shortcuts,

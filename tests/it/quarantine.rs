@@ -2,7 +2,7 @@
 //! [selftest](densify::selftest) covers gradients whose square overflows.
 
 use densify::core::gaussians::{Gaussians, ModelArray};
-use densify::render::{Backend, NonFinite, NumberKind, Storage, Values};
+use densify::render::{Backend, MomentStorage, NonFinite, NumberKind, Storage, Values};
 use densify::selftest::values::{POISON, SLOTS, remove, slot_mut};
 use densify::selftest::{Setup, Subject, scenes};
 use densify_policies::plan::EditPlan;
@@ -68,11 +68,42 @@ fn every_non_finite_moment_is_found(subject: &Subject) {
     assert!(checked >= 2 * SLOTS, "{checked} moments of a row");
 }
 
+/// Sets the code of NaN for second moment i of row i in each array of moments in bytes on a GPU. The first two bytes of
+/// each word are those of the first of its two numbers.
+fn every_non_finite_second_moment_in_bytes_is_found(subject: &Subject) {
+    let model = scenes::cloud(SLOTS + 3, 3, &scenes::camera(33, 30, 71), 72);
+    let storage = Storage { moments: MomentStorage::Both8, ..Storage::default() };
+    let mut backend = make_with(subject, &model, Setup { storage, ..Setup::default() });
+    let names: Vec<String> = backend.state().into_iter().map(|array| array.name).collect();
+    let mut seen = 0;
+    for name in names.iter().filter(|name| name.starts_with("device.moments")) {
+        let sound = backend.save(name).expect("moments");
+        let mut poisoned = sound.clone();
+        let (bytes, numbers) = (sound.shape[1], sound.shape[1] / 2);
+        let Values::U8(codes) = &mut poisoned.values else { panic!("{name} has no bytes") };
+        (0..numbers).for_each(|row| codes[row * bytes + 2 * row + 1] = 0xff);
+        backend.restore(poisoned).expect("a restored array");
+        let found = backend.audit().expect("an audit");
+        let rows: Vec<usize> = found.iter().map(|u| u.row as usize).collect();
+        assert_eq!(rows, (0..numbers).collect::<Vec<_>>(), "{name}");
+        assert!(found.iter().all(|u| u.kind == NumberKind::Moment), "{name}");
+        backend.restore(sound).expect("a restored array");
+        assert!(backend.audit().expect("an audit").is_empty(), "{name}");
+        seen += numbers;
+    }
+    assert!(seen >= SLOTS, "{seen} moments of a row");
+}
+
 #[test]
 fn every_non_finite_value_is_found() {
     on_each(repeatable(), |subject| {
         every_non_finite_parameter_is_found(subject, Storage::default());
         every_non_finite_moment_is_found(subject);
+        if let Subject::Gpu(_) = subject {
+            let [.., smallest] = storages();
+            every_non_finite_parameter_is_found(subject, smallest);
+            every_non_finite_second_moment_in_bytes_is_found(subject);
+        }
     });
     for storage in storages() {
         every_non_finite_parameter_is_found(&Subject::NATIVE, storage);

@@ -6,7 +6,7 @@ use densify_policies::policy::{
     Signal, SignalSet,
 };
 
-use crate::subject::{make, make_with, repeatable, saved, step_input, storages};
+use crate::subject::{devices, make, make_with, repeatable, saved, step_input, storages};
 use densify::core::budget::RowBudget;
 use densify::core::camera::Camera;
 use densify::core::gaussians::Gaussians;
@@ -102,7 +102,10 @@ fn a_restored_backend_continues_identically() {
         let setups = [(0, with_accumulation), (141, with_masks)];
         setups.map(|(frozen, needs)| (subject.clone(), (Storage::default(), frozen, needs)))
     });
-    for (subject, setup) in all.chain(stored) {
+    let on_devices = devices().iter().cloned().map(Subject::Gpu);
+    let [.., smallest] = storages();
+    let stored_on_devices = on_devices.map(|subject| (subject, (smallest, 0, with_accumulation)));
+    for (subject, setup) in all.chain(stored).chain(stored_on_devices) {
         let needs = setup.2();
         let mut whole = backend(&subject, setup, &model);
         whole.begin_epoch();

@@ -20,7 +20,7 @@ use crate::ParameterStorage;
 use densify_core::gaussians::Gaussians;
 
 /// Number of planes of the means, which are always f32.
-const MEANS: usize = plane::LOG_SCALE;
+pub(crate) const MEANS: usize = plane::LOG_SCALE;
 /// Number of planes of bounded parameters.
 const BOUNDED: usize = plane::SH - plane::LOG_SCALE;
 
@@ -29,6 +29,22 @@ const fn fractional_bits(bounded: usize) -> u32 {
     match bounded + MEANS {
         plane::QUAT..plane::OPACITY => 14,
         _ => 11,
+    }
+}
+
+/// A parameter that is no mean, counted as in [`ModelArray`](densify_core::gaussians::ModelArray), rounded to its 16 bits.
+pub(crate) fn narrowed(parameter: usize, x: f32) -> u16 {
+    match parameter.checked_sub(plane::SH) {
+        None => fixed::nearest(x, digits(parameter - MEANS)).cast_unsigned(),
+        Some(_) => F16::nearest(x).0,
+    }
+}
+
+/// The inverse of [`narrowed`].
+pub(crate) fn widened(parameter: usize, bits: u16) -> f32 {
+    match parameter.checked_sub(plane::SH) {
+        None => fixed::to_f32(bits.cast_signed(), digits(parameter - MEANS)),
+        Some(_) => F16(bits).to_f32(),
     }
 }
 

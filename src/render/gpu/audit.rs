@@ -1,7 +1,7 @@
 //! Finds rows with a number that is not finite; see [`audit`](crate::audit). Only a mark per row is copied to the host.
 
 use super::GpuBackend;
-use super::launches::{Audit, MOMENTS};
+use super::launches::{Audit, MOMENT_MARKS};
 use super::passes::Recorder;
 use crate::{BackendError, NonFinite, NumberKind};
 use densify_core::gaussians::ModelArray;
@@ -24,8 +24,9 @@ impl GpuBackend {
         let marks = self.read("sums", 0, bytes)?;
         let marked = (0..).zip(&marks).filter_map(|(row, mark)| {
             let place = mark.to_bits().checked_sub(1)?;
-            let kind = if place < MOMENTS { NumberKind::Parameter } else { NumberKind::Moment };
-            let array = ModelArray::of_parameter((place % MOMENTS) as usize);
+            let kind =
+                if place < MOMENT_MARKS { NumberKind::Parameter } else { NumberKind::Moment };
+            let array = ModelArray::of_parameter((place % MOMENT_MARKS) as usize);
             Some(NonFinite { row, array, kind })
         });
         Ok(marked.collect())

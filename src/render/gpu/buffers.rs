@@ -2,24 +2,27 @@
 
 use std::collections::HashMap;
 
-use wgpu::{Buffer, BufferDescriptor};
+use wgpu::{BindingResource, Buffer, BufferBinding, BufferDescriptor};
 
 use super::device::Device;
-use super::sizes::{PlannedBuffer, Sizes};
+use super::sizes::{PlannedBuffer, SCRATCH, ScratchRange, Sizes};
 use crate::{BackendError, Fit};
 
 /// The buffers, by name.
 #[derive(Debug)]
 pub(super) struct Buffers {
     named: HashMap<&'static str, Buffer>,
+    ranges: Vec<ScratchRange>,
     placeholder: Buffer,
 }
 
 impl Buffers {
     /// Allocates all buffers.
     pub(super) fn new(device: &Device, sizes: &Sizes) -> Result<Self, BackendError> {
-        let planned = sizes.planned();
+        let mut planned = sizes.planned();
         check_sizes(device, &planned, sizes)?;
+        // Largest first, so that small ones fill the allocator's blocks.
+        planned.sort_by_key(|planned| std::cmp::Reverse(planned.bytes));
         let total = planned.iter().map(|p| p.bytes).sum();
         let named = device.guarded("the training buffers", total, |device| {
             planned
@@ -28,7 +31,7 @@ impl Buffers {
                 .collect::<HashMap<&'static str, Buffer>>()
         })?;
         let placeholder = named["placeholder"].clone();
-        Ok(Self { named, placeholder })
+        Ok(Self { named, ranges: sizes.ranges(), placeholder })
     }
 
     /// Reallocates the buffers whose size has changed.
@@ -49,6 +52,7 @@ impl Buffers {
             changed.iter().map(|p| (p.name, create(device, p))).collect::<Vec<_>>()
         })?;
         self.named.extend(new);
+        self.ranges = sizes.ranges();
         Ok(())
     }
 
@@ -56,6 +60,26 @@ impl Buffers {
     /// replaced by a few bytes that are never read.
     pub(super) fn get(&self, name: &str) -> &Buffer {
         self.named.get(name).unwrap_or(&self.placeholder)
+    }
+
+    /// The buffer that contains a buffer or range of this name, and its first byte there.
+    pub(super) fn place(&self, name: &str) -> (&Buffer, u64) {
+        match self.range(name) {
+            Some(range) => (self.get(SCRATCH), range.at),
+            None => (self.get(name), 0),
+        }
+    }
+
+    /// The buffer or range of this name as a kernel binds it.
+    pub(super) fn binding(&self, name: &str) -> BindingResource<'_> {
+        let Some(range) = self.range(name) else { return self.get(name).as_entire_binding() };
+        let buffer = self.get(SCRATCH);
+        let size = std::num::NonZeroU64::new(range.bytes);
+        BindingResource::Buffer(BufferBinding { buffer, offset: range.at, size })
+    }
+
+    fn range(&self, name: &str) -> Option<&ScratchRange> {
+        self.ranges.iter().find(|range| range.name == name)
     }
 
     /// Current total size of all buffers `[bytes]`.
@@ -73,26 +97,29 @@ fn create(device: &wgpu::Device, planned: &PlannedBuffer) -> Buffer {
     })
 }
 
-/// Fails if a buffer is larger than the device can bind: a driver may accept it and fail later.
+/// Fails if a buffer or range is larger than the device can bind: a driver may accept it and fail later.
 fn check_sizes(
     device: &Device,
     planned: &[PlannedBuffer],
     sizes: &Sizes,
 ) -> Result<(), BackendError> {
     let most = device.largest_binding();
-    // No kernel binds the buffer of photographs, which is no larger than the device's largest buffer.
-    let bound_buffers = planned.iter().filter(|p| p.name != "photographs");
-    let Some(worst) = bound_buffers.max_by_key(|p| p.bytes).filter(|p| p.bytes > most) else {
+    // No kernel binds the whole of these two, which are no larger than the device's largest buffer.
+    let bound_buffers = planned.iter().filter(|p| !["photographs", SCRATCH].contains(&p.name));
+    let bound_buffers = bound_buffers.map(|p| (p.name, p.line, p.bytes));
+    let ranges = sizes.ranges().into_iter().map(|range| (range.name, range.line, range.bytes));
+    let worst = bound_buffers.chain(ranges).max_by_key(|(.., bytes)| *bytes);
+    let Some((name, buffer, bytes)) = worst.filter(|(.., bytes)| *bytes > most) else {
         return Ok(());
     };
-    let fit = match worst.name {
-        "records" | "keys 0" | "sums" => Fit::TileCap(most / (worst.bytes / sizes.cap).max(1)),
+    let fit = match name {
+        "records" | "list" | "keys 0" | "sums" => Fit::TileCap(most / (bytes / sizes.cap).max(1)),
         "canvas" | "finish" | "pixel gradient" | "derivatives" => Fit::ImageSize,
         _ => Fit::Budget(device.summary.largest_budget(sizes.sh_degree)),
     };
     Err(BackendError::BufferTooLarge {
-        buffer: worst.line,
-        bytes: worst.bytes,
+        buffer,
+        bytes,
         device: device.summary.name.clone(),
         most,
         fit,

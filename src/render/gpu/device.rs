@@ -11,6 +11,7 @@ use wgpu::{DeviceDescriptor, ErrorFilter, Features, MemoryHints};
 use super::adapter::{choose, enumerate, features_for};
 use super::clock::{self, Clock};
 use super::pipelines::{Pipelines, Variant};
+use super::sizes::{ALLOCATOR_BLOCK, UPLOAD_BYTES};
 use super::{GpuBackend, memory_plan};
 use crate::signals::RecordLayout;
 use crate::{Accumulation, AdapterChoice, AdapterSummary, BackendError, Differentiable, Setup};
@@ -94,6 +95,8 @@ pub(super) struct Device {
     pub(super) summary: AdapterSummary,
     pub(super) accumulation: Accumulation,
     reported: Arc<Mutex<ReportedErrors>>,
+    /// Bytes written to the queue since the last wait, for which wgpu holds copies.
+    written: Mutex<u64>,
     /// The compiled variants.
     pipelines: Mutex<Vec<(Variant, Arc<Pipelines>)>>,
     /// The record layouts for which the device has passed the canary.
@@ -112,8 +115,10 @@ impl Device {
             // No more than is used: requested features can change how a driver compiles.
             required_features: Features::IMMEDIATES | features_for(accumulation) | more,
             required_limits: adapter.limits(),
-            // Buffers are few and allocated once: no pools beyond the ledger.
-            memory_hints: MemoryHints::MemoryUsage,
+            // Buffers above the size of a block have exactly the memory that they need.
+            memory_hints: MemoryHints::Manual {
+                suballocated_device_memory_block_size: ALLOCATOR_BLOCK..ALLOCATOR_BLOCK,
+            },
             ..DeviceDescriptor::default()
         };
         let (device, queue) = wait(adapter.request_device(&descriptor)).map_err(|e| {
@@ -135,6 +140,7 @@ impl Device {
             summary,
             accumulation,
             reported,
+            written: Mutex::default(),
             pipelines: Mutex::default(),
             passed: Mutex::default(),
         })
@@ -186,6 +192,27 @@ impl Device {
         lock(&self.reported).error.get_or_insert_with(|| why.clone());
         let device = self.summary.name.clone();
         self.check().err().unwrap_or(BackendError::Device { device, why })
+    }
+
+    /// Writes to a buffer, starting at byte `at`. Waits whenever [`UPLOAD_BYTES`] have been written, so that the copies
+    /// that wgpu holds until the device has taken them are never larger.
+    pub(super) fn write(&self, buffer: &wgpu::Buffer, at: u64, bytes: &[u8]) {
+        let mut written = self.written.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut at = at;
+        for chunk in bytes.chunks(UPLOAD_BYTES as usize) {
+            let length = chunk.len() as u64;
+            if *written + length > UPLOAD_BYTES {
+                self.queue.submit([]);
+                if let Err(error) = self.device.poll(wgpu::PollType::wait_indefinitely()) {
+                    // Kept for the next check.
+                    self.failed(error.to_string());
+                }
+                *written = 0;
+            }
+            self.queue.write_buffer(buffer, at, chunk);
+            *written += length;
+            at += length;
+        }
     }
 
     /// Runs `create` and returns the errors that the device reports meanwhile; `what` and `bytes` describe the result.
@@ -312,6 +339,31 @@ mod tests {
             }
             assert!(error.is_some() && backend.download().is_err(), "after {checks} checks");
         }
+    }
+
+    /// Everything that the allocator has reserved is in the ledger, also while a model is uploaded. With larger blocks,
+    /// or copies of whole arrays, the device would hold more.
+    #[test]
+    fn the_allocator_reserves_no_more_than_the_ledger() {
+        let Some(device) = software_device() else { return };
+        let camera = Camera::centred((640, 480), (500.0, 500.0), DMat3::IDENTITY, DVec3::ZERO);
+        let mut model = Gaussians::zeros(50_000, 3);
+        // Behind the camera: only memory matters here.
+        model.means.iter_mut().for_each(|mean| mean[2] = -2.0);
+        model.quats.iter_mut().for_each(|quat| quat[0] = 1.0);
+        let setup =
+            Setup { largest_image: (640, 480), tile_cap: Some(200_000), ..Setup::new(model.len()) };
+        let mut backend = GpuBackend::new(&model, &setup, &device).expect("a backend");
+        let reserved = || {
+            let report = device.0.device.generate_allocator_report();
+            report.map(|report| report.total_reserved_bytes)
+        };
+        let Some(uploaded) = reserved() else { return };
+        backend.render(&camera, [0.0; 3], 0).expect("a rendering");
+        let promised = backend.ledger().on_device();
+        let found = [uploaded, reserved().unwrap_or(0)];
+        assert!(found.iter().all(|bytes| *bytes <= promised), "{found:?} of {promised}");
+        assert!(found[1] > promised / 2, "{found:?} of {promised}");
     }
 
     #[test]

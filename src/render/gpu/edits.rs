@@ -164,7 +164,7 @@ fn rounds_of_swaps(order: &[u32]) -> [Vec<[u32; 2]>; 2] {
 impl GpuBackend {
     /// Uploads one chunk of operations and submits the dispatches that `encode` records.
     fn execute(&self, words: &[u32], encode: impl FnOnce(&mut Recorder<'_>)) {
-        self.device.queue.write_buffer(self.buffers.get("ops"), 0, bytemuck::cast_slice(words));
+        self.write("ops", bytemuck::cast_slice(words));
         self.submit(encode);
     }
 

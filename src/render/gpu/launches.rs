@@ -9,14 +9,16 @@ use wgpu::{BindGroup, BindGroupDescriptor, BindGroupEntry, ComputePipeline, Devi
 
 use super::buffers::Buffers;
 use super::pipelines::{CompiledKernel, Pipelines};
-use super::rows::{Edited, FIRST, PARAMETERS, RowArray, SECOND, WAITING};
+use super::rows::{Content, Edited, FIRST, MOMENTS, PARAMETERS, RowArray, SECOND, WAITING};
 use super::sizes::Sizes;
 use crate::{Accumulation, NumberKind};
+use densify_shaders::Formats;
 
 /// Sources of the error per pixel: the loss's error, or its gradient.
 const ERROR_MAPS: [&str; 2] = ["error", "pixel gradient"];
 const KEYS: [&str; 2] = ["keys 0", "keys 1"];
-const VALUES: [&str; 2] = ["values 0", "values 1"];
+/// The sorted values end in the first, the lists.
+const VALUES: [&str; 2] = ["list", "values"];
 
 /// A kernel's variable and the buffer bound to it.
 pub(super) type Rebinding = (&'static str, &'static str);
@@ -71,12 +73,12 @@ pub(super) struct Audit<L> {
     /// Numbers per row.
     pub(super) numbers: u32,
     /// A row whose number i is the first that is not finite is marked with `mark` + i + 1. `mark` is the index of the
-    /// array's first parameter, plus [`MOMENTS`] for moments.
+    /// array's first parameter, plus [`MOMENT_MARKS`] for moments.
     pub(super) mark: u32,
 }
 
 /// Offset from a parameter's mark to that of its moments; larger than the number of parameters of a row.
-pub(super) const MOMENTS: u32 = 64;
+pub(super) const MOMENT_MARKS: u32 = 64;
 
 impl Launches {
     /// Binds all kernels to the buffers.
@@ -105,10 +107,7 @@ fn launch(
         .map(|binding| {
             let other = rebindings.iter().find(|(variable, _)| *variable == binding.name);
             let name = other.map_or(&*binding.name, |(_, buffer)| buffer);
-            BindGroupEntry {
-                binding: binding.number,
-                resource: buffers.get(name).as_entire_binding(),
-            }
+            BindGroupEntry { binding: binding.number, resource: buffers.binding(name) }
         })
         .collect();
     let bindings = device.create_bind_group(&BindGroupDescriptor {
@@ -129,12 +128,13 @@ impl<L> Launches<L> {
         bind: Bind<'_, L>,
         sizes: &Sizes,
     ) -> Self {
-        let rebound = rebound();
+        let rebound = rebound(sizes.formats());
         let launches = |kernel: &str| match rebound.get(base_name(kernel)) {
             None => vec![bind(kernel, &[])],
             Some(lists) => lists.iter().map(|rebindings| bind(kernel, rebindings)).collect(),
         };
-        let is_single = |kernel: &&str| !["copy_rows", "swap_rows", "audit"].contains(kernel);
+        let of_rows = ["copy_rows", "swap_rows", "audit", "audit_bytes", "audit_halves"];
+        let is_single = |kernel: &&str| !of_rows.contains(kernel);
         Self {
             by_kernel: kernels
                 .filter(is_single)
@@ -174,41 +174,60 @@ pub(super) fn base_name(kernel: &str) -> &str {
 }
 
 /// The kernels with variables that are bound to buffers of other names, with the exceptions of each launch. Of two
-/// launches, the first reads `keys 0` and `values 0`.
-pub(super) fn rebound() -> HashMap<&'static str, Vec<Vec<Rebinding>>> {
+/// launches, the first reads `keys 0` or writes the lists.
+pub(super) fn rebound(formats: Formats) -> HashMap<&'static str, Vec<Vec<Rebinding>>> {
     let two = |rebindings: &dyn Fn(usize) -> Vec<Rebinding>| vec![rebindings(0), rebindings(1)];
-    let list = |i: usize| ("list", VALUES[i]);
-    let scatter = |i: usize, values_to| {
-        let from = [("keys in", KEYS[i]), ("values in", VALUES[i])];
-        [&from[..], &[("keys out", KEYS[1 - i]), ("values out", values_to)]].concat()
+    let scatter = |keys: usize, values: usize, values_to| {
+        let from = [("keys in", KEYS[keys]), ("values in", VALUES[values])];
+        [&from[..], &[("keys out", KEYS[1 - keys]), ("values out", values_to)]].concat()
+    };
+    let emitted = |i: usize| match formats.accumulation {
+        Accumulation::Slots => "row of slot",
+        _ => VALUES[i],
+    };
+    let moments = |part: usize| {
+        if formats.moments_in_bytes {
+            vec![("moments", MOMENTS[part])]
+        } else {
+            vec![("first", FIRST[part]), ("second", SECOND[part])]
+        }
     };
     let adam = |part: usize| {
-        let moments = [("first", FIRST[part]), ("second", SECOND[part])];
-        [&[("params", PARAMETERS[part]), ("waiting", WAITING[part])], &moments[..]].concat()
+        let params = (part > 0).then_some(("params", PARAMETERS[part]));
+        let others = [("waiting", WAITING[part])].into_iter().chain(params);
+        others.chain(moments(part)).collect()
     };
     let keys_in = two(&|i| vec![("keys in", KEYS[i])]);
     HashMap::from([
         ("compact", vec![vec![("keys out", KEYS[0]), ("values out", VALUES[0])]]),
         ("count_digits", keys_in.clone()),
         ("find_tiles", keys_in),
-        // The third launch writes the order of rows.
-        ("scatter", vec![scatter(0, VALUES[1]), scatter(1, VALUES[0]), scatter(1, "order")]),
-        ("emit_entries", vec![vec![("keys out", KEYS[0])]]),
-        ("rasterize", two(&|i| vec![list(i)])),
-        ("rasterize_bwd", two(&|i| vec![list(i)])),
+        // The first four by the numbers of their keys and values; the fifth writes the order of rows.
+        (
+            "scatter",
+            vec![
+                scatter(0, 0, VALUES[1]),
+                scatter(0, 1, VALUES[0]),
+                scatter(1, 0, VALUES[1]),
+                scatter(1, 1, VALUES[0]),
+                scatter(1, 1, "order"),
+            ],
+        ),
+        ("emit_entries", two(&|i| vec![("keys out", KEYS[0]), ("values out", emitted(i))])),
         ("similarity", vec![vec![("gradient", "pixel gradient")]]),
         ("pixel_gradient", vec![vec![("gradient", "pixel gradient")]]),
         ("expose_bwd", vec![vec![("gradient", "pixel gradient")]]),
         ("adam_band", (0..4).map(|band| adam(1 + band)).collect()),
         ("adam_geometry", vec![adam(0)]),
+        ("clamp_opacity", vec![moments(0)]),
         // Borrows the buffer of prefix sums, which is long enough and unused between two steps.
         ("present", vec![vec![("signals", "sums")]]),
-        // Borrows the gradients of the rows, which are unused between two steps.
-        ("surface", two(&|i| vec![list(i), ("pixels", "ops"), ("points", "gradient")])),
+        // Borrows the sums of the rows, which are unused before the backward pass.
+        ("surface", vec![vec![("pixels", "ops"), ("points", "row sums")]]),
         ("count_errors", two(&|i| vec![("map", ERROR_MAPS[i])])),
         ("narrow", vec![vec![("worst", "gradient")]]),
         ("write_worst", two(&|i| vec![("map", ERROR_MAPS[i]), ("worst", "gradient")])),
-        ("replay", two(&|i| vec![list(i), ("map", "pixel gradient")])),
+        ("replay", vec![vec![("map", "pixel gradient")]]),
         ("gather", vec![vec![("all records", "records")]]),
         ("gather_columns", vec![vec![("all records", "records")]]),
     ])
@@ -237,13 +256,18 @@ fn audits<L>(bind: Bind<'_, L>, sizes: &Sizes) -> Vec<Audit<L>> {
     let arrays = sizes.row_arrays();
     let audit = |array: &RowArray| {
         let first = array.parameters.start as u32;
+        let kernel = match array.content {
+            Content::NarrowMoments => "audit_bytes",
+            _ if array.is_narrow => "audit_halves",
+            _ => "audit",
+        };
         Some(Audit {
-            launch: bind("audit", &[("marks", "sums"), ("numbers", array.name)]),
+            launch: bind(kernel, &[("marks", "sums"), ("numbers", array.name)]),
             first_row: sizes.row_range(array)[0] as u32,
             numbers: array.numbers as u32,
             mark: match array.content.traits().audited? {
                 NumberKind::Parameter => first,
-                NumberKind::Moment => MOMENTS + first,
+                NumberKind::Moment => MOMENT_MARKS + first,
             },
         })
     };

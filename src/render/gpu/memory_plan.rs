@@ -18,7 +18,10 @@ pub(super) fn max_pairs(device: &Device, needs: &Needs) -> u64 {
         Accumulation::Slots => RecordLayout::new(needs.signals).stride() as u64,
         Accumulation::SubgroupCas | Accumulation::SubgroupAtomics => 1,
     };
-    (device.largest_binding() / (4 * numbers)).min(MAX_ENTRIES)
+    let by_binding = device.largest_binding() / (4 * numbers);
+    // Three lists are sorted in one buffer, each at an aligned place.
+    let by_buffer = (device.summary.largest_buffer / 3).saturating_sub(256) / 4;
+    by_binding.min(by_buffer).min(MAX_ENTRIES)
 }
 
 /// Sizes of all buffers.
@@ -36,6 +39,7 @@ pub(super) fn sizes(device: &Device, sh_degree: u8, options: &Setup) -> Sizes {
     let mut sizes = Sizes::new(budget, cap, sh_degree, image, &options.needs, device.accumulation);
     sizes.photographs = options.photographs;
     sizes.exposures = options.exposures;
+    sizes.storage = options.storage;
     // The photographs are in one buffer, which no kernel binds.
     let bytes = sizes.photograph_bytes().iter().sum::<u64>();
     let max = usize::try_from(device.summary.largest_buffer / bytes).unwrap_or(usize::MAX);

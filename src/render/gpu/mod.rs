@@ -218,12 +218,12 @@ fn launches(
     (shortcuts, antialiasing): (Shortcuts, Antialiasing),
     buffers: &Buffers,
 ) -> Result<Launches, BackendError> {
-    let &Sizes { records, alpha_and_depth, accumulation, counts_dominant, .. } = sizes;
+    let &Sizes { records, alpha_and_depth, counts_dominant, .. } = sizes;
     let variant = Variant {
         records,
         alpha_and_depth,
         shortcuts,
-        accumulation,
+        formats: sizes.formats(),
         counts_dominant,
         antialiasing,
     };

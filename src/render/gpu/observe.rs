@@ -32,7 +32,7 @@ impl GpuBackend {
         count: usize,
         [width, height, ..]: [u32; 4],
     ) -> Option<Search> {
-        // The result, which begins with its length, borrows the buffer of the rows' gradients.
+        // The result, which begins with its length, borrows the range of the rows' gradients.
         let room = (GRADIENT / 2 * self.sizes.trained() as usize - 1).min(u32::MAX as usize);
         let wanted = count_to_rank(count, request.spaced);
         (wanted <= room).then_some(Search {
@@ -127,9 +127,10 @@ impl GpuBackend {
         let focal = 0.5 * (frame.lens[0] + frame.lens[1]);
         let is_median = u32::from(mode == DepthMode::Median);
         let mut found = Vec::new();
-        // A chunk must fit into the upload (one number per pixel), and its points into the buffer of the rows'
-        // gradients (four numbers per point).
-        let room = (OPS_BYTES as usize / 4).min(GRADIENT / 4 * self.sizes.trained() as usize);
+        // A chunk must fit into the upload (one number per pixel), and its points into the buffer of the rows' sums
+        // (four numbers per point).
+        let sums = self.sizes.records.stride() * self.sizes.budget.total;
+        let room = (OPS_BYTES as usize / 4).min(sums / 4);
         for chunk in pixels.chunks(room) {
             let numbers: Vec<u32> =
                 chunk.iter().map(|&(x, y, _)| y as u32 * width + x as u32).collect();
@@ -137,7 +138,7 @@ impl GpuBackend {
             self.continue_view(*shape, |passes, to| {
                 passes.surface(to, numbers.len() as u32, is_median, 0);
             });
-            let points = self.read("gradient", 0, 16 * chunk.len() as u64)?;
+            let points = self.read("row sums", 0, 16 * chunk.len() as u64)?;
             for (&(x, y, error), &[px, py, pz, depth]) in
                 chunk.iter().zip(points.as_chunks::<4>().0)
             {

@@ -28,7 +28,7 @@ const COUNTS_AGAIN: u32 = 3;
 const DIGITS_OF_ROWS: u32 = 4;
 const DIGITS_OF_ENTRIES: u32 = 5;
 /// The launch of `scatter` that writes the order of rows.
-const TO_ORDER: usize = 2;
+const TO_ORDER: usize = 4;
 /// Band number that stands for the whole image.
 const WHOLE: u32 = u32::MAX;
 
@@ -132,7 +132,9 @@ impl Passes<'_> {
         } else {
             (args::ROW_BLOCKS, args::ROW_DIGITS, DIGITS_OF_ROWS)
         };
-        let immediates = [4 * digit, items, u32::from(items == 1 && digit == 0), 0];
+        // With slots, the values of the first digit are the indices of the entries.
+        let of_indices = l.in_slots && items == 1 && digit == 0;
+        let immediates = [4 * digit, items, u32::from(of_indices), 0];
         to.run_counted(l.nth("count_digits", source), immediates, self.groups, blocks);
         to.run_counted(l.get("scan_blocks"), [sum, 0, 0, 0], self.groups, digits);
         to.run(l.get("scan_sums"), [sum, 0, 0, 0], 1);
@@ -153,7 +155,7 @@ impl Passes<'_> {
         to.run(l.get("compact"), [0; 4], rows.div_ceil(256));
         to.stage("sort by depth");
         for digit in 0..8 {
-            let number = if digit == 7 { TO_ORDER } else { digit as usize % 2 };
+            let number = if digit == 7 { TO_ORDER } else { 3 * (digit as usize % 2) };
             self.sort_digit(to, digit, 0, l.nth("scatter", number));
         }
         to.stage("tiles");
@@ -165,7 +167,7 @@ impl Passes<'_> {
         for band in 0..bands {
             self.lists(to, band, COUNTS_BAND);
             to.stage("rasterize");
-            to.run(l.nth("rasterize", self.sorted()), [band, 0, 0, 0], self.shape.tiles);
+            to.run(l.get("rasterize"), [band, 0, 0, 0], self.shape.tiles);
         }
     }
 
@@ -177,11 +179,6 @@ impl Passes<'_> {
         to.run(l.get("scan_sums"), [sum, self.shape.bands, 0, 0], 1);
     }
 
-    /// Number of the key buffer that holds the sorted entries.
-    fn sorted(&self) -> usize {
-        (self.shape.tile_digits() % 2) as usize
-    }
-
     /// Builds the tile lists of a band. If there is only one, its entries are already counted.
     fn lists(&self, to: &mut Recorder<'_>, band: u32, sum: u32) {
         let l = self.launches;
@@ -191,12 +188,17 @@ impl Passes<'_> {
             self.count(to, band, sum);
         }
         let tiles = if several { band } else { WHOLE };
-        to.run_counted(l.get("emit_entries"), [tiles, 0, 0, 0], self.groups, args::ROWS);
-        for digit in 0..self.shape.tile_digits() {
-            self.sort_digit(to, digit, 1, l.nth("scatter", digit as usize % 2));
+        // Keys and values alternate between two ranges each; the last values are the lists.
+        let digits = self.shape.tile_digits();
+        let is_odd = |number: u32| number as usize % 2;
+        let emit = l.nth("emit_entries", is_odd(digits));
+        to.run_counted(emit, [tiles, 0, 0, 0], self.groups, args::ROWS);
+        for digit in 0..digits {
+            let [keys, values] = [is_odd(digit), is_odd(digits - digit)];
+            self.sort_digit(to, digit, 1, l.nth("scatter", 2 * keys + values));
         }
         let groups = (self.shape.tiles + 1).div_ceil(256);
-        to.run(l.nth("find_tiles", self.sorted()), [0; 4], groups);
+        to.run(l.nth("find_tiles", is_odd(digits)), [0; 4], groups);
     }
 
     /// Applies the photograph's exposure to the rendered image.
@@ -236,7 +238,7 @@ impl Passes<'_> {
                 self.lists(to, band, COUNTS_AGAIN);
                 to.stage("rasterize_bwd");
             }
-            to.run(l.nth("rasterize_bwd", self.sorted()), [band, 0, 0, 0], tiles);
+            to.run(l.get("rasterize_bwd"), [band, 0, 0, 0], tiles);
             if l.in_slots {
                 to.run(l.get("gather"), [band, 0, 0, 0], groups);
             }
@@ -271,14 +273,14 @@ impl Passes<'_> {
         to.stage("adam");
         for band in 0..=usize::from(sh_degree) {
             let [first, coefficients] = [(band * band) as u32, (2 * band + 1) as u32];
-            let numbers = self.shape.rows * 3 * coefficients;
+            let pairs = self.shape.rows * (3 * coefficients).div_ceil(2);
             let immediates = [first, coefficients, 0, 0];
-            to.run(l.nth("adam_band", band), immediates, numbers.div_ceil(256));
+            to.run(l.nth("adam_band", band), immediates, pairs.div_ceil(256));
         }
         to.run(l.get("adam_geometry"), [0; 4], groups);
     }
 
-    /// Writes the pixels with the largest errors to the buffer of the rows' gradients: their number, then the error
+    /// Writes the pixels with the largest errors to the range of the rows' gradients: their number, then the error
     /// bits and the index of each, as many as fit. Pixels whose error equals that of the last one wanted are included.
     pub(super) fn worst(&self, to: &mut Recorder<'_>, search: &Search) {
         let l = self.launches;
@@ -301,7 +303,7 @@ impl Passes<'_> {
                 self.lists(to, band, COUNTS_AGAIN);
             }
             let immediates = [band, pixels, mode, first];
-            to.run(self.launches.nth("surface", self.sorted()), immediates, pixels.div_ceil(256));
+            to.run(self.launches.get("surface"), immediates, pixels.div_ceil(256));
         }
     }
 
@@ -316,7 +318,7 @@ impl Passes<'_> {
             if self.shape.bands > 1 {
                 self.lists(to, band, COUNTS_AGAIN);
             }
-            to.run(l.nth("replay", self.sorted()), [band, 0, 0, 0], self.shape.tiles);
+            to.run(l.get("replay"), [band, 0, 0, 0], self.shape.tiles);
             if l.in_slots {
                 to.run(l.get("gather_columns"), [band, 0, 0, 0], groups);
             }

@@ -6,11 +6,10 @@ use densify_policies::policy::{SUPPORT_WEIGHT, Signal};
 use wgpu::{ComputePipeline, Device, ShaderModule};
 
 use super::kernels::{Binding, kernels, parse};
-use crate::Accumulation;
 use crate::Shortcuts;
 use crate::signals::{Field, ParameterSignal, RecordLayout};
 use densify_core::antialiasing::Antialiasing;
-use densify_shaders::STAGES;
+use densify_shaders::{Formats, STAGES};
 
 /// Compile-time options of the kernels.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -19,7 +18,7 @@ pub(super) struct Variant {
     /// True if gradients of alpha and depth are computed too.
     pub(super) alpha_and_depth: bool,
     pub(super) shortcuts: Shortcuts,
-    pub(super) accumulation: Accumulation,
+    pub(super) formats: Formats,
     /// True if the pixels that each row dominates are counted.
     pub(super) counts_dominant: bool,
     pub(super) antialiasing: Antialiasing,
@@ -78,7 +77,7 @@ impl Pipelines {
     pub(super) fn new(device: &Device, variant: Variant) -> Self {
         let mut compiled = HashMap::new();
         for stage in STAGES {
-            let Some(text) = stage.text(variant.accumulation) else { continue };
+            let Some(text) = stage.text(variant.formats) else { continue };
             let parsed = parse(stage, &text);
             let module = device.create_shader_module(wgpu::ShaderModuleDescriptor {
                 label: Some(stage.name),

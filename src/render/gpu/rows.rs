@@ -4,6 +4,7 @@
 use std::ops::Range;
 
 use crate::NumberKind;
+use crate::cpu::{MEANS, narrowed, widened};
 use densify_core::gaussians::ModelArray;
 use densify_core::memory::Section;
 
@@ -14,11 +15,25 @@ pub(super) const FIRST: PartNames =
     ["first rows", "first sh0", "first sh1", "first sh2", "first sh3"];
 pub(super) const SECOND: PartNames =
     ["second rows", "second sh0", "second sh1", "second sh2", "second sh3"];
+/// Formats of the numbers.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Narrow {
+    /// Both moments of a number take two bytes.
+    pub(super) moments: bool,
+    /// Parameters but means take 16 bits.
+    pub(super) parameters: bool,
+}
+
+/// Both moments, if they are stored in bytes.
+pub(super) const MOMENTS: PartNames =
+    ["moments rows", "moments sh0", "moments sh1", "moments sh2", "moments sh3"];
 pub(super) const WAITING: PartNames =
     ["waiting rows", "waiting sh0", "waiting sh1", "waiting sh2", "waiting sh3"];
 
 /// Numbers per row of the geometry; the last is padding.
 const GEOMETRY: usize = 12;
+/// Words per row of the geometry if all but the means take 16 bits.
+const NARROW_GEOMETRY: usize = 7;
 /// Numbers per row of the gradients; see `shaders/project_bwd.wgsl`.
 pub(super) const GRADIENT: usize = 20;
 
@@ -29,6 +44,8 @@ pub(super) enum Content {
     Colour,
     FirstMoments,
     SecondMoments,
+    /// Both moments of a number in two bytes; see `shaders/shared/moments_both8.wgsl`.
+    NarrowMoments,
     /// Gradients waiting for an optimiser step.
     Waiting,
     /// Number of optimiser steps, as whole numbers.
@@ -44,8 +61,6 @@ pub(super) enum Content {
     Dominated,
     /// Gradients of splats, summed over the current view.
     SplatGradients,
-    /// Gradients of parameters in the current view.
-    RowGradients,
 }
 
 /// The effect of an edit on an array. Moved rows keep their numbers, except in [untouched](Self::Untouched) arrays.
@@ -86,7 +101,7 @@ impl Content {
             Self::Colour => {
                 (Section::Model, "parameters", Inherited, false, Some(NumberKind::Parameter))
             }
-            Self::FirstMoments | Self::SecondMoments => {
+            Self::FirstMoments | Self::SecondMoments | Self::NarrowMoments => {
                 (Section::Model, "optimiser moments", Cleared, true, Some(NumberKind::Moment))
             }
             Self::Waiting => {
@@ -99,10 +114,8 @@ impl Content {
             Self::MaskMoments => (Section::Policy, "masks", Cleared, true, None),
             Self::Dominated => (Section::Policy, "dominated pixels", Untouched, false, None),
             Self::SplatGradients => (Section::Gradients, "splat gradients", Untouched, false, None),
-            Self::RowGradients => (Section::Gradients, "row gradients", Untouched, false, None),
         };
-        let is_for_training =
-            matches!(edited, Cleared) || matches!(self, Self::Masks | Self::RowGradients);
+        let is_for_training = matches!(edited, Cleared) || matches!(self, Self::Masks);
         Traits { section, line, edited, is_saved, audited, is_for_training }
     }
 }
@@ -112,17 +125,57 @@ impl Content {
 pub(super) struct RowArray {
     /// Name of the buffer.
     pub(super) name: &'static str,
-    /// Numbers per row, of four bytes each.
+    /// Numbers per row, of four bytes each; words, if the numbers are narrower.
     pub(super) numbers: usize,
     pub(super) content: Content,
     /// The parameters that the numbers belong to; empty if they belong to none.
     pub(super) parameters: Range<usize>,
+    /// True for parameters in 16 bits.
+    pub(super) is_narrow: bool,
 }
 
 impl RowArray {
     /// Bytes per row.
     pub(super) fn row_bytes(&self) -> u64 {
         4 * self.numbers as u64
+    }
+
+    /// Number of parameters per row that are stored as f32; the others take 16 bits.
+    fn wide(&self) -> usize {
+        match self.content {
+            _ if !self.is_narrow => self.parameters.len(),
+            Content::Geometry => MEANS,
+            _ => 0,
+        }
+    }
+
+    /// The words of rows, from all of the array's parameters of each.
+    pub(super) fn words_of(&self, parameters: &[f32]) -> Vec<u32> {
+        let rows = parameters.chunks_exact(self.parameters.len());
+        let mut words = Vec::with_capacity(rows.len() * self.numbers);
+        for row in rows {
+            let end = words.len() + self.numbers;
+            let (wide, narrow) = row.split_at(self.wide());
+            words.extend(wide.iter().map(|x| x.to_bits()));
+            let first = self.parameters.start + wide.len();
+            let code = |i: usize| narrow.get(i).map_or(0, |&x| narrowed(first + i, x));
+            let pairs = (0..narrow.len()).step_by(2);
+            words.extend(pairs.map(|i| u32::from(code(i)) | u32::from(code(i + 1)) << 16));
+            words.resize(end, 0);
+        }
+        words
+    }
+
+    /// The inverse of [`words_of`](Self::words_of).
+    pub(super) fn parameters_of(&self, words: &[u32]) -> Vec<f32> {
+        let (wide, count) = (self.wide(), self.parameters.len());
+        let of_row = |row: &[u32]| {
+            let code = |i: usize| (row[wide + i / 2] >> (16 * (i % 2))) as u16;
+            let first = self.parameters.start + wide;
+            let narrow = (0..count - wide).map(|i| widened(first + i, code(i)));
+            row[..wide].iter().map(|&bits| f32::from_bits(bits)).chain(narrow).collect::<Vec<_>>()
+        };
+        words.chunks_exact(self.numbers).flat_map(of_row).collect()
     }
 
     /// Distance between rows, and between the numbers of a row, in an array of this number of rows.
@@ -135,11 +188,13 @@ impl RowArray {
 }
 
 /// All arrays for models of this SH degree. `may_wait`: gradients of the geometry and band 0, and those of bands 1–3,
-/// may wait for a step. The last argument has the numbers per row of signals, records, dominated pixels and masks.
+/// may wait for a step. The last argument has the numbers per row of slots, signals, records, dominated pixels and
+/// masks.
 pub(super) fn row_arrays(
     sh_degree: u8,
     may_wait: [bool; 2],
-    [planes, fields, counts, masks]: [usize; 4],
+    narrow: Narrow,
+    [slots, planes, fields, counts, masks]: [usize; 5],
 ) -> Vec<RowArray> {
     let geometry = 0..ModelArray::Sh.parameters(sh_degree).start;
     let band = |band: usize| {
@@ -151,6 +206,7 @@ pub(super) fn row_arrays(
         (Content::Geometry, Content::Colour, PARAMETERS),
         (Content::FirstMoments, Content::FirstMoments, FIRST),
         (Content::SecondMoments, Content::SecondMoments, SECOND),
+        (Content::NarrowMoments, Content::NarrowMoments, MOMENTS),
         (Content::Waiting, Content::Waiting, WAITING),
     ] {
         for (part, name) in names.into_iter().enumerate().take(usize::from(sh_degree) + 2) {
@@ -159,8 +215,18 @@ pub(super) fn row_arrays(
                 _ => (band(part - 1).len(), colour_content, band(part - 1)),
             };
             let (numbers, content, parameters) = array;
-            if content != Content::Waiting || may_wait[usize::from(part > 1)] {
-                all.push(RowArray { name, numbers, content, parameters });
+            let is_narrow =
+                narrow.parameters && matches!(content, Content::Geometry | Content::Colour);
+            let (is_used, numbers) = match content {
+                Content::Waiting => (may_wait[usize::from(part > 1)], numbers),
+                Content::FirstMoments | Content::SecondMoments => (!narrow.moments, numbers),
+                Content::NarrowMoments => (narrow.moments, numbers.div_ceil(2)),
+                Content::Geometry if is_narrow => (true, NARROW_GEOMETRY),
+                Content::Colour if is_narrow => (true, numbers.div_ceil(2)),
+                _ => (true, numbers),
+            };
+            if is_used {
+                all.push(RowArray { name, numbers, content, parameters, is_narrow });
             }
         }
     }
@@ -171,21 +237,25 @@ pub(super) fn row_arrays(
         ("footprints", 4, Content::Projected),
         ("depths", 1, Content::Projected),
         ("order", 1, Content::Projected),
-        ("slots of row", 2, Content::Projected),
+        ("slots of row", slots, Content::Projected),
         ("row sums", fields, Content::SplatGradients),
-        ("gradient", GRADIENT, Content::RowGradients),
         ("dominant", counts, Content::Dominated),
         ("mask offsets", masks, Content::Masks),
         ("mask moments", 2 * masks, Content::MaskMoments),
     ];
-    let without_parameters =
-        |(name, numbers, content)| RowArray { name, numbers, content, parameters: 0..0 };
+    let without_parameters = |(name, numbers, content)| RowArray {
+        name,
+        numbers,
+        content,
+        parameters: 0..0,
+        is_narrow: false,
+    };
     all.extend(others.map(without_parameters));
     all
 }
 
 /// Bytes per row of the widest array for models of this SH degree, for any policy.
 pub(super) fn widest_row(sh_degree: u8) -> u64 {
-    let arrays = row_arrays(sh_degree, [false; 2], [0; 4]);
-    arrays.iter().map(RowArray::row_bytes).max().unwrap_or(0)
+    let arrays = row_arrays(sh_degree, [false; 2], Narrow::default(), [0; 5]);
+    arrays.iter().map(RowArray::row_bytes).max().unwrap_or(0).max(4 * GRADIENT as u64)
 }

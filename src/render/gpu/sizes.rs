@@ -5,22 +5,41 @@ use wgpu::BufferUsages;
 
 use super::exposure;
 use super::frame::{Frame, State, grid};
-use super::rows::{Content, RowArray, row_arrays};
+use super::rows::{Content, GRADIENT, Narrow, RowArray, row_arrays};
 use crate::Accumulation;
-use crate::KeptPhotographs;
 use crate::cpu::BiasCorrection;
 use crate::signals::{Field, RecordLayout, SignalPlanes, counts_dominant};
+use crate::{KeptPhotographs, MomentStorage, ParameterStorage, Storage};
 use densify_core::budget::RowBudget;
 use densify_core::memory::{Ledger, Section};
+use densify_shaders::Formats;
 
 /// Number of bytes of an edit's operations that are uploaded at a time.
 pub(super) const OPS_BYTES: u64 = 1 << 18;
+/// Size of the allocator's blocks, in which it places smaller buffers together `[bytes]`; the smallest that wgpu's
+/// allocators have.
+pub(super) const ALLOCATOR_BLOCK: u64 = 4 << 20;
+/// Largest number of bytes that are on their way to the device at a time.
+pub(super) const UPLOAD_BYTES: u64 = 4 << 20;
 /// Largest number of bytes read back at a time.
 pub(super) const READ_BYTES: u64 = 1 << 20;
 /// Items per workgroup of the prefix sums and sorts; see `shaders/tiles.wgsl`.
 pub(super) const BLOCK: u64 = 2048;
 /// Largest number of (row, tile) pairs in the tile lists at a time; prefix sums saturate beyond it.
 pub(super) const MAX_ENTRIES: u64 = 1 << 28;
+
+/// The smallest buffer that is [rounded](rounded) to a power of two `[bytes]`.
+const SMALLEST_ROUNDED: u64 = 64 << 10;
+
+/// The size of a buffer. Sizes that are powers of two, allocated largest first, fill the allocator's blocks completely;
+/// others could leave nearly half of each block unused. Larger buffers have memory of their own.
+fn rounded(bytes: u64) -> u64 {
+    if (SMALLEST_ROUNDED..ALLOCATOR_BLOCK).contains(&bytes) {
+        bytes.next_power_of_two()
+    } else {
+        bytes.next_multiple_of(16)
+    }
+}
 
 /// The quantities that determine all sizes.
 #[derive(Debug, Clone)]
@@ -38,6 +57,7 @@ pub(super) struct Sizes {
     pub(super) records: RecordLayout,
     /// How gradients are accumulated; only [`Accumulation::Slots`] needs records.
     pub(super) accumulation: Accumulation,
+    pub(super) storage: Storage,
     /// True if gradients of alpha and depth are computed too.
     pub(super) alpha_and_depth: bool,
     pub(super) cadence: Cadence,
@@ -64,6 +84,22 @@ pub(super) struct PlannedBuffer {
     pub(super) usage: BufferUsages,
 }
 
+/// Name of the buffer whose [ranges](Sizes::ranges) are used one after the other.
+pub(super) const SCRATCH: &str = "scratch";
+/// Largest alignment of a range of a buffer that a device may require `[bytes]`.
+const ALIGNMENT: u64 = 256;
+
+/// A range of the buffer [`SCRATCH`], which is bound like a buffer.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct ScratchRange {
+    pub(super) name: &'static str,
+    /// Line of the ledger that it would have as a buffer.
+    pub(super) line: &'static str,
+    /// First byte in the buffer.
+    pub(super) at: u64,
+    pub(super) bytes: u64,
+}
+
 impl Sizes {
     pub(super) fn new(
         budget: RowBudget,
@@ -83,6 +119,7 @@ impl Sizes {
             planes: SignalPlanes::new(needs).count,
             records,
             accumulation,
+            storage: Storage::default(),
             alpha_and_depth: false,
             cadence: needs.cadence,
             counts_dominant: counts_dominant(needs),
@@ -116,9 +153,23 @@ impl Sizes {
 
     /// Every array with an entry per row.
     pub(super) fn row_arrays(&self) -> Vec<RowArray> {
-        let [counts, masks] = [self.counts_dominant, self.with_masks].map(usize::from);
-        let others = [self.planes, self.records.stride(), counts, masks];
-        row_arrays(self.sh_degree, self.may_wait(), others)
+        let in_slots = self.accumulation == Accumulation::Slots;
+        let [slots, counts, masks] =
+            [in_slots, self.counts_dominant, self.with_masks].map(usize::from);
+        let others = [2 * slots, self.planes, self.records.stride(), counts, masks];
+        let formats = self.formats();
+        let narrow =
+            Narrow { moments: formats.moments_in_bytes, parameters: formats.parameters_in_16_bits };
+        row_arrays(self.sh_degree, self.may_wait(), narrow, others)
+    }
+
+    /// The choices that the kernels depend on.
+    pub(super) fn formats(&self) -> Formats {
+        Formats {
+            accumulation: self.accumulation,
+            moments_in_bytes: self.storage.moments == MomentStorage::Both8,
+            parameters_in_16_bits: self.storage.parameters == ParameterStorage::F16,
+        }
     }
 
     /// The arrays that hold the model.
@@ -128,12 +179,31 @@ impl Sizes {
         arrays
     }
 
+    /// The ranges of [`SCRATCH`]. Three uses follow each other in a step: sorting rows and entries, the loss, and the
+    /// gradients of rows between the backward pass and the optimiser.
+    pub(super) fn ranges(&self) -> Vec<ScratchRange> {
+        let range = |line, name, at, bytes: u64| {
+            let bytes = bytes.max(16).next_multiple_of(16);
+            ScratchRange { name, line, at, bytes }
+        };
+        let numbers = (4 * self.cap).next_multiple_of(ALIGNMENT);
+        let sorted = ["keys 0", "keys 1", "values"];
+        let mut all: Vec<_> = (0..)
+            .zip(sorted)
+            .map(|(i, name)| range("entries", name, i * numbers, 4 * self.cap))
+            .collect();
+        let (width, height) = self.image;
+        all.push(range("loss", "derivatives", 0, 36 * u64::from(width) * u64::from(height)));
+        all.push(range("row gradients", "gradient", 0, 4 * GRADIENT as u64 * self.trained()));
+        all
+    }
+
     /// Every buffer.
     pub(super) fn planned(&self) -> Vec<PlannedBuffer> {
         let storage = BufferUsages::STORAGE | BufferUsages::COPY_SRC | BufferUsages::COPY_DST;
         let mut all = Vec::new();
         let mut add = |section, line, name, bytes: u64| {
-            let bytes = bytes.max(16).next_multiple_of(16);
+            let bytes = rounded(bytes.max(16));
             all.push(PlannedBuffer { name, section, line, bytes, usage: storage });
         };
         let cap = self.cap;
@@ -143,10 +213,9 @@ impl Sizes {
             add(traits.section, traits.line, array.name, rows * array.row_bytes());
         }
         add(Section::Model, Content::Ages.traits().line, "bias", BiasCorrection::bytes());
-        for name in ["keys 0", "keys 1", "values 0", "values 1", "row of slot"] {
-            add(Section::Tiles, "entries", name, 4 * cap);
-        }
+        add(Section::Tiles, "entries", "list", 4 * cap);
         if self.accumulation == Accumulation::Slots {
+            add(Section::Tiles, "entries", "row of slot", 4 * cap);
             let bytes = 4 * self.records.stride() as u64 * cap;
             add(Section::Tiles, "gradients per entry", "records", bytes);
         }
@@ -165,7 +234,8 @@ impl Sizes {
         let channels =
             if self.alpha_and_depth { 5 } else { 3 + errors * (1 + u64::from(self.with_edges)) };
         add(Section::Renderer, "image and image gradient", "pixel gradient", 4 * channels * pixels);
-        add(Section::Renderer, "loss", "derivatives", 36 * pixels);
+        let scratch = self.ranges().iter().map(|range| range.at + range.bytes).max();
+        add(Section::Renderer, "sorts, loss, row gradients", SCRATCH, scratch.unwrap_or(0));
         add(Section::Renderer, "loss", "tile sums", 8 * tiles);
         if self.with_error {
             add(Section::Renderer, "loss", "error", 4 * pixels);
@@ -203,12 +273,84 @@ impl Sizes {
         KeptPhotographs::bytes(self.image, self.photographs.with_masks)
     }
 
+    /// Memory that the allocator takes beyond the buffers: copies of what is uploaded, and unused parts of blocks. Of the
+    /// device's blocks, only two are not full, one with the buffers of [`SMALLEST_ROUNDED`] and more, and one with the
+    /// others. Of the blocks for transfers, two that follow each other are at least half full together.
+    fn beyond_buffers() -> [(&'static str, u64); 2] {
+        let of_transfers = UPLOAD_BYTES + READ_BYTES;
+        let unused = 2 * ALLOCATOR_BLOCK + of_transfers + ALLOCATOR_BLOCK;
+        [("uploads", UPLOAD_BYTES), ("unused parts of blocks", unused)]
+    }
+
     /// The ledger: bytes per purpose.
     pub(super) fn ledger(&self) -> Ledger {
         let mut ledger = Ledger::default();
         for PlannedBuffer { section, line, bytes, .. } in self.planned() {
             ledger.add_on_device(section, line, bytes);
         }
+        for (line, bytes) in Self::beyond_buffers() {
+            ledger.add_on_device(Section::Renderer, line, bytes);
+        }
         ledger
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use densify_policies::policy::{CandidateRequest, DepthMode, Signal};
+
+    use super::*;
+    use crate::{MomentStorage, ParameterStorage};
+
+    /// Signals and candidates as the policy `diet` has them by default.
+    fn needs() -> Needs {
+        let signals = [
+            Signal::VisibleCount,
+            Signal::ScreenGradient,
+            Signal::ColourGradient,
+            Signal::MeanGradientX,
+            Signal::MeanGradientY,
+            Signal::MeanGradientZ,
+            Signal::MeanGradientNorm,
+            Signal::WeightMax,
+        ];
+        let candidates = CandidateRequest {
+            from: 0,
+            until: 1,
+            rows_per_candidate: 1,
+            capacity: 1,
+            error: ErrorMode::L1Dssim,
+            depth: DepthMode::Median,
+            min_alpha: 0.0,
+            spaced: false,
+        };
+        Needs {
+            signals: signals.into_iter().collect(),
+            candidates: Some(candidates),
+            ..Needs::default()
+        }
+    }
+
+    /// All memory on the device per row, for a million rows and images of 1.6 megapixels: by default, with moments in
+    /// bytes, and with `--preset tiny-memory`. docs/memory.md has the figures.
+    #[test]
+    fn a_million_rows_take_the_documented_bytes() {
+        const ROWS: usize = 1_000_000;
+        let bytes_per_row = |pairs: u64, storage, accumulation| {
+            let cap = pairs * ROWS as u64;
+            let mut sizes = Sizes::new(ROWS.into(), cap, 3, (1600, 1000), &needs(), accumulation);
+            assert_eq!((sizes.planes, sizes.records.stride()), (9, 10));
+            sizes.storage = storage;
+            sizes.ledger().on_device().div_ceil(ROWS as u64)
+        };
+        let both8 = Storage { moments: MomentStorage::Both8, ..Storage::default() };
+        let smallest = Storage { parameters: ParameterStorage::F16, ..both8 };
+        let cas = Accumulation::SubgroupCas;
+        let found = [(4, Storage::default()), (4, both8), (1, smallest)]
+            .map(|(pairs, storage)| bytes_per_row(pairs, storage, cas));
+        assert_eq!(found, [1069, 717, 598]);
+        // Records, the rows of slots, and the slots of rows.
+        let in_slots = bytes_per_row(4, Storage::default(), Accumulation::Slots);
+        assert_eq!(in_slots - found[0], 4 * (40 + 4) + 8);
     }
 }

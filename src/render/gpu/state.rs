@@ -67,10 +67,9 @@ impl GpuBackend {
         let array = self.saved_array(name);
         let array = array.unwrap_or_else(|| panic!("this backend has no state array `{name}`"));
         let values = self.read_rows(&array, rows.clone())?;
-        if array.content == Content::Ages {
-            // Not floats: their bits are kept as bytes.
+        if is_of_bytes(&array) {
             let bytes = bytemuck::cast_slice(&values).to_vec();
-            return Ok(Tensor::u8(name, &[rows.len(), 4], bytes));
+            return Ok(Tensor::u8(name, &[rows.len(), 4 * array.numbers], bytes));
         }
         Ok(Tensor::f32(name, &[rows.len(), array.numbers], values))
     }
@@ -96,9 +95,10 @@ impl GpuBackend {
             let [first_row, _] = self.sizes.row_range(&array);
             let (first, missing) = stored_rows(first_row, &rows);
             let at = array.row_bytes() * first;
-            if array.content == Content::Ages {
-                let values = tensor.into_u8(&[rows.len(), 4])?;
-                self.write_at(array.name, at, &values[4 * missing..]);
+            if is_of_bytes(&array) {
+                let width = 4 * array.numbers;
+                let values = tensor.into_u8(&[rows.len(), width])?;
+                self.write_at(array.name, at, &values[width * missing..]);
             } else {
                 let values = tensor.into_f32(&[rows.len(), array.numbers])?;
                 self.write_at(array.name, at, &values[array.numbers * missing..]);
@@ -108,4 +108,9 @@ impl GpuBackend {
         }
         Ok(())
     }
+}
+
+/// True if the numbers are no floats; their bits are saved as bytes.
+fn is_of_bytes(array: &RowArray) -> bool {
+    matches!(array.content, Content::Ages | Content::NarrowMoments)
 }

@@ -23,32 +23,34 @@ impl GpuBackend {
     pub(super) fn write_at(&self, name: &str, at: u64, values: &[impl bytemuck::NoUninit]) {
         if !values.is_empty() {
             let bytes = bytemuck::cast_slice(values);
-            self.device.queue.write_buffer(self.buffers.get(name), at, bytes);
+            let (buffer, first) = self.buffers.place(name);
+            self.device.write(buffer, first + at, bytes);
         }
     }
 
     pub(super) fn upload(&self, model: &Gaussians) {
         for array in self.sizes.parameters() {
-            let mut values = Vec::with_capacity(array.numbers * model.len());
+            let mut values = Vec::with_capacity(array.parameters.len() * model.len());
             for i in 0..model.len() {
                 if array.content == Content::Geometry {
                     values.extend_from_slice(&model.means[i]);
                     values.extend_from_slice(&model.log_scales[i]);
                     values.extend_from_slice(&model.quats[i]);
-                    values.extend_from_slice(&[model.opacity_logits[i], 0.0]);
+                    values.push(model.opacity_logits[i]);
                 } else {
                     let Range { start, end } = array.parameters;
                     let first = ModelArray::Sh.parameters(model.sh_degree).start;
                     values.extend_from_slice(&model.sh_of(i)[start - first..end - first]);
                 }
             }
-            self.write(array.name, bytemuck::cast_slice(&values));
+            self.write(array.name, bytemuck::cast_slice(&array.words_of(&values)));
         }
     }
 
     pub(super) fn read(&self, name: &str, from: u64, bytes: u64) -> Result<Vec<f32>, BackendError> {
         let staging = self.buffers.get("read");
-        let bytes = readback::read(&self.device, staging, self.buffers.get(name), from, bytes)?;
+        let (buffer, first) = self.buffers.place(name);
+        let bytes = readback::read(&self.device, staging, buffer, first + from, bytes)?;
         Ok(bytemuck::pod_collect_to_vec(&bytes))
     }
 
@@ -146,6 +148,16 @@ impl GpuBackend {
         Ok(values)
     }
 
+    /// Reads all parameters of an array, row after row.
+    fn parameter_rows(
+        &self,
+        array: &RowArray,
+        rows: Range<usize>,
+    ) -> Result<Vec<f32>, BackendError> {
+        let words = self.read_rows(array, rows)?;
+        Ok(array.parameters_of(bytemuck::cast_slice(&words)))
+    }
+
     /// Reads parameters of rows, row after row.
     pub(super) fn parameters_of(
         &self,
@@ -155,9 +167,9 @@ impl GpuBackend {
         let mut all = vec![0.0; wanted.len() * rows.len()];
         for from in self.sizes.parameters() {
             if let Some((here, there)) = overlap(wanted, &from.parameters) {
-                let read = self.read_rows(&from, rows.clone())?;
+                let read = self.parameter_rows(&from, rows.clone())?;
                 let to = all.chunks_exact_mut(wanted.len());
-                for (to, from) in to.zip(read.chunks_exact(from.numbers)) {
+                for (to, from) in to.zip(read.chunks_exact(from.parameters.len())) {
                     to[here.clone()].copy_from_slice(&from[there.clone()]);
                 }
             }
@@ -190,16 +202,17 @@ impl GpuBackend {
     ) -> Result<(), BackendError> {
         for to in self.sizes.parameters() {
             if let Some((here, there)) = overlap(given, &to.parameters) {
-                let mut all = if there.len() == to.numbers {
-                    vec![0.0; to.numbers * rows.len()]
+                let count = to.parameters.len();
+                let mut all = if there.len() == count {
+                    vec![0.0; count * rows.len()]
                 } else {
-                    self.read_rows(&to, rows.clone())?
+                    self.parameter_rows(&to, rows.clone())?
                 };
-                let by_row = all.chunks_exact_mut(to.numbers);
+                let by_row = all.chunks_exact_mut(count);
                 for (to, from) in by_row.zip(values.chunks_exact(given.len())) {
                     to[there.clone()].copy_from_slice(&from[here.clone()]);
                 }
-                self.write_at(to.name, to.row_bytes() * rows.start as u64, &all);
+                self.write_at(to.name, to.row_bytes() * rows.start as u64, &to.words_of(&all));
             }
         }
         Ok(())

@@ -6,7 +6,6 @@ use crate::failure::{Failure, Remedy};
 use crate::spec::knobs::DEFAULT_PRESET;
 use crate::spec::{Budget, ByteCount, ImageCache, Partial, Rows, RunSpec, ShDegree};
 use densify_data::dataset::Resolution;
-use densify_render::BackendKind;
 
 /// The preset for runs that are short of memory.
 const TINY_MEMORY: &str = "tiny-memory";
@@ -24,16 +23,14 @@ impl Remedy {
     ];
 
     /// The description with this change; `None` if it changes nothing.
-    fn apply(self, spec: &RunSpec, kind: BackendKind) -> Option<RunSpec> {
+    fn apply(self, spec: &RunSpec) -> Option<RunSpec> {
         let mut new = spec.clone();
         let size = &mut new.size;
         match self {
             Self::NoImages => size.image_cache = Some(ImageCache::Bytes(0)),
             Self::NoTileCap => size.tile_cap = None,
             Self::TileCap(pairs) => size.tile_cap = Some(Rows(pairs)),
-            Self::Preset(name) => {
-                new = with_preset(name, spec).filter(|_| kind == BackendKind::Cpu)?;
-            }
+            Self::Preset(name) => new = with_preset(name, spec)?,
             Self::LeastDegree => {
                 let is_fixed = size.full || matches!(size.sh_degree, Some(ShDegree::Fixed(_)));
                 size.sh_degree = is_fixed.then_some(ShDegree::Fixed(0)).or(size.sh_degree);
@@ -67,7 +64,6 @@ pub(super) fn remedies(
     changes: &[Remedy],
     fits: impl Fn(&Case<'_>) -> Result<bool, Failure>,
 ) -> Vec<Vec<Remedy>> {
-    let kind = case.inputs.device.kind();
     // A change that cannot be tried is no remedy.
     let is_remedy = |spec: &RunSpec| case.with(spec).and_then(|case| fits(&case)).unwrap_or(false);
     let shrinks = |change: &Remedy| matches!(change, Remedy::Shrink(_));
@@ -75,12 +71,12 @@ pub(super) fn remedies(
     let mut together = (Vec::new(), base.clone());
     let (mut is_shrunk, mut joint) = (false, None);
     for &change in changes {
-        let alone = change.apply(base, kind).filter(|_| !(shrinks(&change) && is_shrunk));
+        let alone = change.apply(base).filter(|_| !(shrinks(&change) && is_shrunk));
         if alone.is_some_and(|spec| is_remedy(&spec)) {
             singles.push(vec![change]);
             is_shrunk |= shrinks(&change);
         }
-        if let Some(spec) = change.apply(&together.1, kind) {
+        if let Some(spec) = change.apply(&together.1) {
             together.0.retain(|other| !(shrinks(&change) && shrinks(other)));
             together.0.push(change);
             together.1 = spec;

@@ -19,10 +19,16 @@ use densify_render::BackendKind;
 /// Default of `--budget`: a model of this size trains on a laptop in well under 2 GiB, and is enough for a room or an
 /// object; large outdoor scenes need more.
 pub const DEFAULT_BUDGET: usize = 200_000;
+/// Side of a tile `[px]`.
+const TILE: u32 = 16;
 /// Memory for decoded photographs without `--image-cache` `[bytes]`.
 const DEFAULT_IMAGE_CACHE: u64 = 1 << 30;
 /// (Row, tile) pairs per row of the budget without `--memory`.
 const PAIRS_PER_ROW: usize = 16;
+/// On a GPU, lists with more than [`PAIRS`]`[0]` pairs per row have at most this many pairs per tile of the largest image,
+/// or [`PAIRS_OF_SMALL_IMAGE`]. Few views exceed that, and those are rendered in bands.
+const PAIRS_PER_TILE: usize = 512;
+const PAIRS_OF_SMALL_IMAGE: usize = 1 << 20;
 /// Minimum number of trained rows of a useful model, unless the user asks for fewer.
 pub(super) const MIN_ROWS: usize = 1_000;
 /// Memory in messages is rounded up to a multiple of this `[bytes]`.
@@ -43,8 +49,11 @@ impl Size {
     pub(super) fn as_given(case: &Case<'_>) -> Result<Self, Failure> {
         let rows = case.asked_budget().unwrap_or(DEFAULT_BUDGET);
         let max_pairs = max_pairs(case, rows)?;
-        let per_row = case.choices.knobs.pairs_per_row.unwrap_or(PAIRS_PER_ROW);
-        let pairs = rows.saturating_mul(per_row).min(max_pairs);
+        let pairs = match case.choices.knobs.pairs_per_row {
+            Some(per_row) => rows.saturating_mul(per_row),
+            None => case.default_pairs(rows),
+        };
+        let pairs = pairs.min(max_pairs);
         let mut run_size = RunSize {
             rows,
             sh_degree: case.choices.degree.highest(),
@@ -135,6 +144,18 @@ impl Case<'_> {
     /// Minimum number of rows of a useful model, including frozen ones, unless the user asks for fewer.
     fn min_rows(&self) -> usize {
         self.rows_for(MIN_ROWS)
+    }
+
+    /// Maximum number of (row, tile) pairs of this many rows without options about it.
+    fn default_pairs(&self, rows: usize) -> usize {
+        let pairs = rows.saturating_mul(PAIRS_PER_ROW);
+        if self.inputs.device.kind() == BackendKind::Cpu {
+            return pairs;
+        }
+        let (width, height) = self.inputs.dataset.largest_image();
+        let tiles = width.div_ceil(TILE) as usize * height.div_ceil(TILE) as usize;
+        let by_tiles = tiles.saturating_mul(PAIRS_PER_TILE).max(PAIRS_OF_SMALL_IMAGE);
+        pairs.min(rows.saturating_mul(PAIRS[0]).max(by_tiles))
     }
 
     /// The limit that the user set on the number of rows, if any.

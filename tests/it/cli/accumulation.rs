@@ -102,3 +102,24 @@ fn devices_lists_the_accumulation_methods() {
         assert!(methods.iter().all(|method| line.contains(method.name())), "{listed}");
     }
 }
+
+/// Narrow parameters and moments on a device survive a checkpoint.
+#[test]
+fn tiny_memory_resumes_exactly_on_every_device() {
+    let scene = Photographs::colmap_text();
+    for device in devices() {
+        let (root, whole) = scratch();
+        let gpu = ["--gpu", &*device.adapter().name, "--deterministic", "--preset", "tiny-memory"];
+        run(scene.path(), &whole, &gpu).ok();
+        let knobs = &config(&whole)["knob"];
+        for (name, value) in
+            [("param_storage", "f16"), ("moment_storage", "both8"), ("pairs_per_row", "1")]
+        {
+            assert_eq!(knobs[name].as_str(), Some(value));
+        }
+        let part = root.path().join("part");
+        copy_unfinished(&whole, &part, ITERATIONS);
+        densify(&["train", text(scene.path()), "-o", text(&part), "--resume"]).ok();
+        assert!(model(&whole, ITERATIONS) == model(&part, ITERATIONS), "the models differ");
+    }
+}

@@ -179,7 +179,8 @@ fn on_a_gpu_the_limit_applies_to_device_memory() {
         let on_device = lines.iter().filter(|line| line["on_device"] == true);
         let bytes: u64 = on_device.map(|line| count(line, "bytes")).sum();
         // `gpu::ledger` checks that the backend allocates exactly what the ledger says.
-        assert!(bytes <= 48 * MIB && bytes > 47 * MIB, "{name}: {bytes}");
+        // Small buffers grow in steps: their sizes are powers of two.
+        assert!(bytes <= 48 * MIB && bytes > 42 * MIB, "{name}: {bytes}");
         assert!(planned.stdout.contains("on the device"), "{name}: {}", planned.stdout);
         // Accumulation by atomics needs no gradient records, which leaves room for more Gaussians.
         let most = count(&summary, "budget");

@@ -16,11 +16,17 @@ use super::super::launches::{Launches, Rebinding, base_name, rebound};
 use super::super::pipelines::Variant;
 use super::super::sizes::Sizes;
 use super::*;
-use crate::KeptPhotographs;
 use crate::Shortcuts;
 use crate::signals::RecordLayout;
+use crate::{KeptPhotographs, MomentStorage, ParameterStorage};
 use densify_core::antialiasing::Antialiasing;
-use densify_shaders::{Accumulation, STAGES};
+use densify_shaders::{Accumulation, Formats, STAGES};
+
+const SLOTS: Formats = Formats {
+    accumulation: Accumulation::Slots,
+    moments_in_bytes: false,
+    parameters_in_16_bits: false,
+};
 
 /// Capabilities that naga must allow in addition to those of every WebGPU device.
 fn capabilities(accumulation: Accumulation) -> Capabilities {
@@ -34,9 +40,9 @@ fn capabilities(accumulation: Accumulation) -> Capabilities {
     .fold(Capabilities::IMMEDIATES, |all, (_, capability)| all | capability)
 }
 
-/// The shader modules of devices with this accumulation, with their texts.
-fn modules(accumulation: Accumulation) -> impl Iterator<Item = (&'static Stage, String, Module)> {
-    let texts = STAGES.iter().filter_map(move |stage| Some((stage, stage.text(accumulation)?)));
+/// The shader modules of these formats, with their texts.
+fn modules(formats: Formats) -> impl Iterator<Item = (&'static Stage, String, Module)> {
+    let texts = STAGES.iter().filter_map(move |stage| Some((stage, stage.text(formats)?)));
     texts.map(|(stage, text)| {
         let module = parse(stage, &text);
         (stage, text, module)
@@ -46,9 +52,9 @@ fn modules(accumulation: Accumulation) -> impl Iterator<Item = (&'static Stage, 
 #[test]
 fn every_shader_is_valid_and_within_the_portable_limits() {
     let mut seen = BTreeSet::new();
-    for accumulation in Accumulation::ALL {
-        for (stage, text, module) in modules(accumulation) {
-            check_stage(stage, &text, &module, capabilities(accumulation));
+    for formats in Formats::all() {
+        for (stage, text, module) in modules(formats) {
+            check_stage(stage, &text, &module, capabilities(formats.accumulation));
             seen.insert(stage.name);
         }
     }
@@ -86,20 +92,20 @@ fn every_override_has_a_value_and_every_signal_a_number() {
         alpha_and_depth: true,
         shortcuts: Shortcuts::default(),
         antialiasing: Antialiasing::Wide,
-        accumulation: Accumulation::Slots,
+        formats: SLOTS,
         counts_dominant: true,
     };
     let constants: BTreeSet<String> =
         variant.constants().into_iter().map(|(name, _)| name).collect();
     let mut declared = BTreeSet::new();
-    for (_, _, module) in Accumulation::ALL.into_iter().flat_map(modules) {
+    for (_, _, module) in Formats::all().flat_map(modules) {
         declared.extend(module.overrides.iter().filter_map(|(_, o)| o.name.clone()));
     }
     assert_eq!(declared, constants);
 }
 
 /// The sizes of a backend with every optional buffer.
-fn largest_sizes(accumulation: Accumulation) -> Sizes {
+fn largest_sizes(formats: Formats) -> Sizes {
     let candidates = CandidateRequest {
         from: 0,
         until: 1,
@@ -116,7 +122,13 @@ fn largest_sizes(accumulation: Accumulation) -> Sizes {
         cadence: Cadence { all: 2, sh_rest: 2 },
         ..Needs::default()
     };
-    let mut sizes = Sizes::new(10.into(), 100, 3, (32, 32), &needs, accumulation);
+    let mut sizes = Sizes::new(10.into(), 100, 3, (32, 32), &needs, formats.accumulation);
+    if formats.moments_in_bytes {
+        sizes.storage.moments = MomentStorage::Both8;
+    }
+    if formats.parameters_in_16_bits {
+        sizes.storage.parameters = ParameterStorage::F16;
+    }
     sizes.photographs = KeptPhotographs { count: 1, with_masks: true };
     sizes.exposures = true;
     sizes
@@ -126,18 +138,20 @@ fn largest_sizes(accumulation: Accumulation) -> Sizes {
 #[test]
 fn every_kernel_is_dispatched_by_its_name() {
     let mut found_kernels = BTreeSet::new();
-    for (stage, text, module) in Accumulation::ALL.into_iter().flat_map(modules) {
+    for (stage, text, module) in Formats::all().flat_map(modules) {
         let found = kernels(stage, &text, &module);
         found_kernels.extend(found.into_iter().map(|kernel| base_name(&kernel.entry).to_owned()));
     }
-    for kernel in rebound().keys() {
+    for kernel in rebound(SLOTS).keys() {
         assert!(
             found_kernels.contains(*kernel),
             "`rebound` has buffers for `{kernel}`, which is no kernel"
         );
     }
     // These are bound to each array of rows, not dispatched by name.
-    let mut dispatched = BTreeSet::from(["copy_rows", "swap_rows", "audit"].map(str::to_owned));
+    let mut dispatched = BTreeSet::from(
+        ["copy_rows", "swap_rows", "audit", "audit_bytes", "audit_halves"].map(str::to_owned),
+    );
     let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/gpu");
     for entry in std::fs::read_dir(folder).expect("the sources") {
         let path = entry.expect("a file").path();
@@ -153,9 +167,9 @@ fn every_kernel_is_dispatched_by_its_name() {
 /// A variable without a buffer would be bound to the placeholder.
 #[test]
 fn every_variable_has_a_buffer() {
-    for accumulation in Accumulation::ALL {
+    for formats in Formats::all() {
         let mut found_kernels = BTreeMap::new();
-        for (stage, text, module) in modules(accumulation) {
+        for (stage, text, module) in modules(formats) {
             for Kernel { entry, bindings } in kernels(stage, &text, &module) {
                 assert!(
                     found_kernels.insert(entry.clone(), bindings).is_none(),
@@ -163,8 +177,10 @@ fn every_variable_has_a_buffer() {
                 );
             }
         }
-        let sizes = largest_sizes(accumulation);
-        let buffers: BTreeSet<_> = sizes.planned().into_iter().map(|p| p.name).collect();
+        let sizes = largest_sizes(formats);
+        let ranges = sizes.ranges().into_iter().map(|range| range.name);
+        let buffers: BTreeSet<_> =
+            sizes.planned().into_iter().map(|p| p.name).chain(ranges).collect();
         let bind = |kernel: &str, rebindings: &[Rebinding]| {
             let bindings = &found_kernels[kernel];
             for (variable, buffer) in rebindings {
@@ -191,7 +207,7 @@ macro_rules! layout {
 #[test]
 fn struct_layouts_are_those_of_the_shaders() {
     let project = &STAGES[0];
-    let text = project.text(Accumulation::Slots).expect("every device projects");
+    let text = project.text(SLOTS).expect("every device projects");
     let module = parse(project, &text);
     let layouts = [
         layout!(Frame: rotation centre lens ratio background image model rates more_rates noise score draw frozen planes),

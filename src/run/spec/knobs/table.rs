@@ -2,7 +2,7 @@
 
 use super::Class::{Bounded, Exact};
 use super::{Domain, Knob, number};
-use densify_render::BackendKind::{Cpu, Gpu};
+use densify_render::BackendKind::Gpu;
 use densify_render::{Accumulation, MomentStorage, ParameterStorage};
 
 /// All knobs: the exact ones, then the bounded ones.
@@ -12,9 +12,9 @@ pub static KNOBS: &[Knob] = &[
         default: "auto",
         domain: Domain::Choice(&["auto", "4", "2", "1"]),
         unit: "pairs",
-        only_on: Some(Cpu),
+        only_on: None,
         class: Exact,
-        effect: "tile pairs per Gaussian, 2 in 5 with gradients; auto: 16 (4 to 16 with --memory), all with gradients",
+        effect: "tile pairs per Gaussian (CPU: 2 in 5 with gradients); auto: 16, on a GPU 4 for large models, with --memory 4 to 16",
         levels: &["4", "2", "1"],
         set: |knobs, value| knobs.pairs_per_row = value.parse().ok(),
     },
@@ -56,7 +56,7 @@ pub static KNOBS: &[Knob] = &[
         default: "f32",
         domain: Domain::Choice(&["f32", "f16"]),
         unit: "",
-        only_on: Some(Cpu),
+        only_on: None,
         class: Bounded,
         effect: "f16: parameters other than means in 2 bytes, rounded at random; 112 bytes less per Gaussian of degree 3",
         levels: &["f16"],
@@ -72,7 +72,7 @@ pub static KNOBS: &[Knob] = &[
         default: "f32",
         domain: Domain::Choice(&["f32", "both8"]),
         unit: "",
-        only_on: Some(Cpu),
+        only_on: None,
         class: Bounded,
         effect: "both8: each of the optimiser's two moments in one byte",
         levels: &["both8"],
