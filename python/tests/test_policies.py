@@ -309,7 +309,10 @@ def test_the_plug_in_of_pytest_runs_the_conformance_suite(tmp_path: Path) -> Non
 
 def test_a_file_that_starts_a_run_when_it_is_imported_is_refused(tmp_path: Path) -> None:
     file = tmp_path / "runs.py"
-    file.write_text("import densify\ndensify.train('scene:spheres')\n")
+    output = tmp_path / "run"
+    file.write_text(
+        f"import densify\ndensify.train('scene:spheres', iterations=1, budget=300, output={str(output)!r})\n"
+    )
     with pytest.raises(densify.InputError, match="__main__"):
         densify.import_policies(str(file))
 

@@ -70,6 +70,7 @@ fn config_toml_contains_every_option_of_a_run() {
         "sparse",
         "views",
         "freeze",
+        "policy_file",
         "gpu",
         "threads",
     ];
