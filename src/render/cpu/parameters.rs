@@ -35,7 +35,7 @@ const fn fractional_bits(bounded: usize) -> u32 {
 /// A parameter that is no mean, counted as in [`ModelArray`](densify_core::gaussians::ModelArray), rounded to its 16 bits.
 pub(crate) fn narrowed(parameter: usize, x: f32) -> u16 {
     match parameter.checked_sub(plane::SH) {
-        None => fixed::nearest(x, digits(parameter - MEANS)).cast_unsigned(),
+        None => fixed::nearest(x, fractional_bits(parameter - MEANS)).cast_unsigned(),
         Some(_) => F16::nearest(x).0,
     }
 }
@@ -43,7 +43,7 @@ pub(crate) fn narrowed(parameter: usize, x: f32) -> u16 {
 /// The inverse of [`narrowed`].
 pub(crate) fn widened(parameter: usize, bits: u16) -> f32 {
     match parameter.checked_sub(plane::SH) {
-        None => fixed::to_f32(bits.cast_signed(), digits(parameter - MEANS)),
+        None => fixed::to_f32(bits.cast_signed(), fractional_bits(parameter - MEANS)),
         Some(_) => F16(bits).to_f32(),
     }
 }
