@@ -1,8 +1,13 @@
 //! The registry of dataset formats. A new format is one file that defines a [`DatasetFormat`], its line
 //! in [`formats`], and a folder of example files in `tests/fuzz/corpus` with the format's name.
 
+use std::path::Path;
+
+use serde_json::Value;
+
 use super::paths::Root;
-use super::{LoadError, LoadOptions, Scene, colmap, realitycapture, transforms};
+use super::{LoadError, LoadOptions, Note, Scene, colmap, realitycapture, transforms};
+use super::{frame_lists, json};
 
 /// A format of datasets in folders.
 #[derive(Debug, Clone, Copy)]
@@ -32,7 +37,11 @@ pub(super) fn read_scene(root: &Root, options: &LoadOptions) -> Result<Scene, Lo
     // `sparse` names one of several COLMAP models, so no other format is tried.
     let chosen = options.sparse.is_some();
     for format in formats().iter().filter(|format| !chosen || format.name == colmap::FORMAT.name) {
-        if let Some(scene) = (format.read)(root, options)? {
+        if let Some(mut scene) = (format.read)(root, options)? {
+            if format.name == colmap::FORMAT.name && !chosen {
+                let unread = unread_note(root.path(), &scene.listing);
+                scene.notes.extend(unread.map(Note::Text));
+            }
             return Ok(scene);
         }
     }
@@ -45,4 +54,23 @@ pub(super) fn read_scene(root: &Root, options: &LoadOptions) -> Result<Scene, Lo
             .collect::<Vec<_>>()
             .join(" nor of ")
     )))
+}
+
+/// Note about a `transforms.json` beside a COLMAP model, which lists its images in `listing`. (Other combinations are the
+/// rule: nerfstudio keeps the model that its file was made from.)
+fn unread_note(root: &Path, listing: &Path) -> Option<String> {
+    let file = root.join(transforms::SINGLE);
+    if !file.is_file() {
+        return None;
+    }
+    let model = listing.parent().and_then(|folder| folder.strip_prefix(root).ok())?.display();
+    let fields = json::read(&file).ok();
+    let is_list =
+        |field: &&str| fields.as_ref().and_then(|all| all.get(*field)).is_some_and(Value::is_array);
+    let lists =
+        if frame_lists::FIELDS.iter().any(is_list) { ", nor are its lists of views" } else { "" };
+    let name = transforms::SINGLE;
+    Some(format!(
+        "{name} is not read{lists}: {model} takes precedence unless you move it elsewhere"
+    ))
 }

@@ -305,3 +305,19 @@ fn a_far_off_scene_keeps_its_precision() {
     }
     assert!(far.normalisation.is_remote() && !data.normalisation.is_remote());
 }
+
+/// Photographers keep exports of several programs in one folder.
+#[test]
+fn a_file_that_another_format_supersedes_is_named() {
+    let made = Made::colmap_txt();
+    let unread = |data: &Dataset| {
+        data.notes.iter().filter(|note| note.contains("transforms.json is not read")).count()
+    };
+    assert_eq!(unread(&load(&made)), 0);
+    made.write("transforms.json", r#"{"frames": []}"#);
+    assert_noted(&load(&made), "transforms.json is not read: sparse/0 takes precedence");
+    made.write("transforms.json", r#"{"frames": [], "test_filenames": ["a.png"]}"#);
+    assert_noted(&load(&made), "not read, nor are its lists of views: sparse/0 takes precedence");
+    let chosen = LoadOptions { sparse: Some("sparse/0".into()), ..LoadOptions::default() };
+    assert_eq!(unread(&load_with(&made, &chosen)), 0);
+}
