@@ -144,6 +144,11 @@ fn read(root: &Root, options: &LoadOptions) -> Result<Option<Scene>, LoadError> 
             held_out: false,
         });
     }
+    if are_degrees(&frames) {
+        let problem = "the coordinates look like longitudes and latitudes in degrees";
+        let remedy = "export them in a metric coordinate system, such as `local:1 - Euclidean`";
+        return Err(LoadError::malformed(path, "x, y", problem, remedy));
+    }
     let mut notes = Vec::new();
     if let Some(first) = missing.first() {
         let (missing, all) = (missing.len(), missing.len() + frames.len());
@@ -162,6 +167,24 @@ fn read(root: &Root, options: &LoadOptions) -> Result<Option<Scene>, LoadError> 
     let listing = path.to_owned();
     let (notes, rest) = (text_notes(notes), Scene::default());
     Ok(Some(Scene { listing, frames, first_missing, points, points_file, notes, ..rest }))
+}
+
+/// Returns true if x and y can be degrees and vary far less than the height. A degree is 111 km; in metres, such cameras
+/// would be a vertical line, from which nothing can be reconstructed.
+fn are_degrees(frames: &[Frame]) -> bool {
+    /// Largest spread of longitudes and latitudes: 11 km.
+    const MAX_SPREAD: f64 = 0.1;
+    /// Smallest ratio of the spreads of heights in metres and of degrees: 0.3 m for an area of 1 km.
+    const RATIO: f64 = 30.0;
+    let centre = |frame: &Frame| -(frame.rotation.transpose() * frame.translation);
+    let empty = (DVec3::INFINITY, DVec3::NEG_INFINITY);
+    let (low, high) = frames
+        .iter()
+        .map(centre)
+        .fold(empty, |(low, high), centre| (low.min(centre), high.max(centre)));
+    let (farthest, spread) = (low.abs().max(high.abs()), high - low);
+    let wide = spread.x.max(spread.y);
+    farthest.x <= 180.0 && farthest.y <= 90.0 && wide < MAX_SPREAD && spread.z > RATIO * wide
 }
 
 /// Column names in lower case; those of RealityScan 2 are replaced with the older ones.

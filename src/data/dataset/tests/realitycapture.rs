@@ -67,6 +67,36 @@ fn lengths_are_relative_to_the_longer_side() {
     assert!((b.fx - 15.0).abs() < 1e-12);
 }
 
+/// Replaces the positions of the three cameras.
+fn moved(centres: [[f64; 3]; 3]) -> Made {
+    let made = Made::realitycapture();
+    let text = std::fs::read_to_string(made.file(TABLE)).unwrap();
+    let mut centres = centres.iter();
+    let lines = text.lines().map(|line| {
+        let mut cells: Vec<String> = line.split(',').map(str::to_owned).collect();
+        if line.starts_with("images/") {
+            cells.splice(1..4, centres.next().unwrap().map(|value| value.to_string()));
+        }
+        cells.join(",") + "\n"
+    });
+    made.write(TABLE, lines.collect::<String>());
+    made
+}
+
+#[test]
+fn coordinates_in_degrees_are_refused() {
+    let (lon, lat) = (-34.828_786_5, -7.163_311_9);
+    let made = moved([[lon, lat, 85.0], [lon + 1e-4, lat, 84.5], [lon, lat + 2e-4, 85.25]]);
+    refused("degrees", &made, &LoadOptions::default(), "cameras.csv, x, y, degrees, local:1");
+    // A few centimetres around a small object, and a flight at almost constant height in metres.
+    for centres in [
+        [[2.0, 1.0, 0.0], [2.05, 1.0, 0.02], [2.0, 1.05, 0.5]],
+        [[0.0, 0.0, 85.0], [50.0, 0.0, 84.5], [0.0, 50.0, 85.25]],
+    ] {
+        assert_eq!(load(&moved(centres)).train.len(), 3);
+    }
+}
+
 /// RealityScan 2 has other names for the same columns.
 #[test]
 fn tables_of_realityscan_load_the_same() {
