@@ -96,7 +96,11 @@ impl<'a> Reader<'a> {
     /// Reads the number of records, each of which takes at least `size` bytes; more than `max_count` are an error.
     fn count(&mut self, field: &str, size: u64, max_count: u64) -> Result<u64, LoadError> {
         let count = self.u64(field)?;
-        if count > max_count || count > self.left / size {
+        if count > max_count {
+            let problem = format!("the file says {count}, but at most {max_count} are supported");
+            return Err(self.fault(field, problem));
+        }
+        if count > self.left / size {
             let problem = format!(
                 "the file says {count}, but the {} bytes that follow hold at most {}",
                 self.left,
@@ -217,4 +221,31 @@ pub(super) fn points(
     }
     reader.expect_end("points", count)?;
     Ok(points)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A file of 100 bytes cannot hold 13 records of 8 bytes, and 12 may be more than are supported.
+    #[test]
+    fn impossible_counts_state_the_limit_that_they_exceed() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("points3D.bin");
+        for (count, max, words) in [
+            (12, 20, None),
+            (13, 20, Some("the 100 bytes that follow hold at most 12")),
+            (12, 11, Some("at most 11 are supported")),
+        ] {
+            std::fs::write(&path, [&u64::to_le_bytes(count)[..], &[0; 100]].concat()).unwrap();
+            let found = Reader::open(&path).unwrap().count("number of points", 8, max);
+            match words {
+                None => assert_eq!(found.unwrap(), count),
+                Some(words) => {
+                    let message = found.unwrap_err().to_string();
+                    assert!(message.contains(words), "{message}");
+                }
+            }
+        }
+    }
 }

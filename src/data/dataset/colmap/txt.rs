@@ -117,11 +117,13 @@ pub(super) fn cameras(path: &Path) -> Result<HashMap<u32, Lens>, LoadError> {
         let model = words.next().ok_or_else(|| lines.fault(&field, "the model is missing"))?;
         let model = LensModel::named(path, &field, model)?;
         let size = [lines.number(&mut words, "width")?, lines.number(&mut words, "height")?];
+        let (found, needed) = (words.clone().count(), model.parameters());
+        if found != needed {
+            let problem = format!("{} has {needed} parameters, not {found}", model.name);
+            return Err(lines.fault(&field, problem));
+        }
         let next = || lines.number(&mut words, "camera parameters");
         let lens = camera::lens(model, path, &field, size, next)?;
-        if words.next().is_some() {
-            return Err(lines.fault(&field, "there are more parameters than the model has"));
-        }
         if cameras.insert(id, lens).is_some() {
             return Err(lines.fault(&field, "the id occurs twice"));
         }

@@ -85,6 +85,11 @@ pub(crate) const FISHEYE_FIELDS: [(&str, Term); 4] =
     [("k1", A(0)), ("k2", A(1)), ("k3", A(2)), ("k4", A(3))];
 
 impl LensModel {
+    /// Number of parameters: focal lengths, the principal point and the distortion.
+    pub(crate) fn parameters(&self) -> usize {
+        self.focals + 2 + self.terms.len()
+    }
+
     /// The model with this name in COLMAP's text files.
     pub(crate) fn named(file: &Path, camera: &str, name: &str) -> Result<&'static Self, LoadError> {
         MODELS.iter().find(|model| model.name == name).ok_or_else(|| {
