@@ -168,8 +168,8 @@ impl Folders {
         // If the dataset lies in the chosen folder, that folder's subfolders are not searched for further photographs.
         let is_deep = !self.chosen.as_ref().is_some_and(|folder| folder.contains(&self.root));
         add_photographs(folder, "", is_deep, &mut names);
-        // A name may have several Unicode spellings.
-        let spelled = |name: &str| name.nfc().collect::<String>();
+        // A name may have several Unicode spellings, and its extension may be in upper or lower case.
+        let spelled = |name: &str| name.nfc().collect::<String>().to_ascii_lowercase();
         let used: HashSet<String> = frames.iter().map(|frame| spelled(&frame.name)).collect();
         names.iter().filter(|name| !used.contains(&spelled(name))).count()
     }

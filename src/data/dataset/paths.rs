@@ -77,8 +77,11 @@ impl Root {
     /// As [`join`](Self::join), but also refuses links that lead out of the folder; `None` if there is no such file.
     pub(super) fn existing(&self, named: DataPath<'_>) -> Result<Option<PathBuf>, LoadError> {
         let mut path = self.join(named)?;
-        if !named.value.is_ascii() && !path.exists() {
-            path = self.other_spelling(&relative(named.value)).unwrap_or(path);
+        if !path.exists() {
+            let spelled = (!named.value.is_ascii())
+                .then(|| self.other_spelling(&relative(named.value)))
+                .flatten();
+            path = spelled.or_else(|| other_case(&path)).unwrap_or(path);
         }
         match path.canonicalize() {
             Ok(real) if !real.starts_with(&self.canonical) => {
@@ -111,6 +114,13 @@ impl Root {
         let names = searched.entry(folder).or_insert_with_key(|folder| names(folder));
         names.get(&name.nfc().collect::<String>()).cloned()
     }
+}
+
+/// The file whose extension is in the other case, such as `a.JPG` for `a.jpg`: Windows and macOS do not distinguish them.
+fn other_case(path: &Path) -> Option<PathBuf> {
+    let ending = path.extension()?.to_str()?;
+    let cases = [ending.to_ascii_lowercase(), ending.to_ascii_uppercase()];
+    cases.iter().map(|ending| path.with_extension(ending)).find(|path| path.exists())
 }
 
 fn names(folder: &Path) -> Names {
@@ -223,6 +233,21 @@ mod tests {
             let both = folder.path().join(listed);
             fs::create_dir_all(both.parent().unwrap()).unwrap();
             fs::write(&both, "itself").unwrap();
+            assert_eq!(fs::read(existing(&root, listed).unwrap().unwrap()).unwrap(), b"itself");
+        }
+    }
+
+    #[test]
+    fn extensions_are_found_in_either_case() {
+        for (listed, written) in [("a.JPG", "a.jpg"), ("a.jpg", "a.JPG"), ("é.png", "é.PNG")] {
+            let folder = tempfile::tempdir().unwrap();
+            fs::write(folder.path().join(written), "other").unwrap();
+            let root = Root::new(folder.path()).unwrap();
+            let found = existing(&root, listed).unwrap().expect(listed);
+            assert_eq!(fs::read(found).unwrap(), b"other");
+            assert_eq!(existing(&root, "A.jpg").unwrap(), None, "another name");
+            // If both exist, the listed one counts.
+            fs::write(folder.path().join(listed), "itself").unwrap();
             assert_eq!(fs::read(existing(&root, listed).unwrap().unwrap()).unwrap(), b"itself");
         }
     }
