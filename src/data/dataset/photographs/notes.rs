@@ -41,12 +41,11 @@ fn narrow_note(
     checked: &[Checked],
     resolution: Option<Resolution>,
 ) -> Option<String> {
-    let (Some(Resolution::Width(width)), Some(first)) = (resolution, frames.first()) else {
-        return None;
-    };
-    let is_narrow = checked.iter().any(|checked| checked.header.width < width);
-    let first = &first.name;
-    is_narrow.then(|| format!("images narrower than {width} px are not enlarged ({first})"))
+    let Some(Resolution::Width(width)) = resolution else { return None };
+    let narrow = || frames.iter().zip(checked).filter(|(_, checked)| checked.header.width < width);
+    let first = &narrow().next()?.0.name;
+    let count = counted(narrow().count(), "image");
+    Some(format!("{count} narrower than {width} px not enlarged (first: {first})"))
 }
 
 /// Note about photographs that are turned to match their cameras.

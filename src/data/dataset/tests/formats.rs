@@ -321,3 +321,12 @@ fn a_file_that_another_format_supersedes_is_named() {
     let chosen = LoadOptions { sparse: Some("sparse/0".into()), ..LoadOptions::default() };
     assert_eq!(unread(&load_with(&made, &chosen)), 0);
 }
+
+#[test]
+fn the_note_on_narrow_images_names_one_of_them() {
+    let made = Made::colmap_txt();
+    image(&made.file("images/b.png"), (10, 6), 9);
+    let resolution = Some(Resolution::Width(15));
+    let data = load_with(&made, &LoadOptions { resolution, ..LoadOptions::default() });
+    assert_noted(&data, "1 image narrower than 15 px, first: b.png");
+}
