@@ -11,6 +11,7 @@ use super::accessors::{Accessor, Buffers, View};
 use super::layout::{LOG_SCALE, OPACITY_LOGIT, SPLATS, coefficient};
 use super::nodes;
 use crate::error::LoadError;
+use crate::models::ply::activation::may_be_logarithms;
 use crate::models::quantise::{log_of_scale, quantised_logit};
 use crate::models::rows::{Row, Rows, SplatFile};
 use crate::models::statement::stated_in_json;
@@ -270,7 +271,15 @@ fn splats(
             sh: &sh,
         });
     }
-    rows.finish(path)
+    let mut file = rows.finish(path)?;
+    if log_scales.is_none() && may_be_logarithms(&file.gaussians, scales.as_chunks().0) {
+        file.notes.push(
+            "its scales may be logarithms, although glTF stores scales as they are: if all Gaussians are too large or too \
+             small, export the file again"
+                .to_owned(),
+        );
+    }
+    Ok(file)
 }
 
 /// Appends a part; the result has the higher of the two degrees.

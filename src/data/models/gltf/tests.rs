@@ -7,6 +7,7 @@ use serde_json::{Value, json};
 use super::accessors::{Accessor, Buffers, View};
 use super::layout::{SPLATS, coefficient};
 use super::read::SPZ;
+use crate::models::ply::activation::may_be_logarithms;
 use crate::models::read_model;
 use densify_core::gaussians::Gaussians;
 
@@ -111,4 +112,22 @@ fn logarithms_and_logits_are_refused_with_the_reason() {
         let message = read(scale, opacity).unwrap_err();
         assert!(words.iter().all(|word| message.contains(word)), "{message}");
     }
+}
+
+/// In a scene of a thousand units, all logarithms may be positive, so that their signs tell nothing.
+#[test]
+fn scales_that_may_be_logarithms_are_noted() {
+    let mut model = Gaussians::default();
+    for row in 0..1000_u16 {
+        let at = |prime: u16| f32::from(row * prime % 1000);
+        model.means.push([at(7), at(11), at(13)]);
+    }
+    let scales = |axes: &dyn Fn(f32) -> [f32; 3]| -> Vec<[f32; 3]> {
+        (0..1000_u16).map(|row| axes(f32::from(row * 37 % 1000) / 1000.0)).collect()
+    };
+    let logarithms = scales(&|x| [1.0 + 3.0 * x, 1.5 + 2.0 * x, 0.5 + x]);
+    let flat = scales(&|x| [1.0 + 3.0 * x, 1.5 + 2.0 * x, 0.01 * x]);
+    let small = scales(&|x| [0.1 + 0.3 * x, 0.2 + 0.1 * x, 0.05 + x * 0.01]);
+    let found = [logarithms, flat, small].map(|scales| may_be_logarithms(&model, &scales));
+    assert_eq!(found, [true, false, false]);
 }

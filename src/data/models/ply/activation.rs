@@ -20,7 +20,7 @@ pub(super) fn undo(model: &mut Gaussians) -> Vec<String> {
     let are_opacities =
         may_be_opacities && most_opaque > NEAR_OPAQUE && most_opaque - faintest > SPREAD;
     let varies = smallest < largest || (are_opacities && largest > 0.0);
-    let are_scales = smallest >= 0.0 && varies && !are_logarithms(model);
+    let are_scales = smallest >= 0.0 && varies && !are_logarithms(model, &model.log_scales);
     let mut notes = Vec::new();
     if are_opacities || (may_be_opacities && are_scales) {
         for value in &mut model.opacity_logits {
@@ -49,16 +49,33 @@ pub(super) fn undo(model: &mut Gaussians) -> Vec<String> {
     notes
 }
 
-/// True if scales are plausible as logarithms: some Gaussians are much larger than others, but most are smaller than
-/// the model.
-fn are_logarithms(model: &Gaussians) -> bool {
+/// Returns true if a model's `scales` are plausible as logarithms: some Gaussians are much larger than others, but most
+/// are smaller than the model.
+fn are_logarithms(model: &Gaussians, scales: &[[f32; 3]]) -> bool {
     let mut largest: Vec<f32> =
-        model.log_scales.iter().map(|logs| logs.iter().copied().fold(0.0, f32::max)).collect();
+        scales.iter().map(|axes| axes.iter().copied().fold(0.0, f32::max)).collect();
     let middle = largest.len() / 2;
     let median = f64::from(*largest.select_nth_unstable_by(middle, f32::total_cmp).1);
     let extent = middles_and_spreads(model).iter().map(|(_, spread)| *spread).fold(0.0, f64::max);
     // With a median below ln 2, the standard deviations of half of all Gaussians would lie between 1 and 2.
     median > std::f64::consts::LN_2 && median.exp() < extent
+}
+
+/// Returns true if a model's `scales` from a file of standard deviations may be logarithms that are all positive: they are
+/// plausible as logarithms, and hardly any Gaussian is flat, as most are in trained models.
+pub(crate) fn may_be_logarithms(model: &Gaussians, scales: &[[f32; 3]]) -> bool {
+    /// Length of the shortest axis of a flat Gaussian, relative to the median axis of all.
+    const FLAT: f32 = 0.05;
+    /// Largest share of axes that may be as short among logarithms.
+    const FEW: f64 = 0.01;
+    let mut axes = scales.as_flattened().to_vec();
+    if axes.is_empty() || !are_logarithms(model, scales) {
+        return false;
+    }
+    let middle = axes.len() / 2;
+    let median = *axes.select_nth_unstable_by(middle, f32::total_cmp).1;
+    let short = axes.iter().filter(|axis| **axis < FLAT * median).count();
+    short as f64 <= FEW * axes.len() as f64
 }
 
 /// The smallest and the largest value.

@@ -1,7 +1,7 @@
 //! Splat PLY, binary little endian, in the layout of the original 3DGS trainer (Kerbl et al. 2023, `save_ply`). The
 //! reader accepts every encoding and order of properties.
 
-mod activation;
+pub(super) mod activation;
 pub(super) mod layout;
 mod read;
 mod write;
