@@ -89,6 +89,7 @@ pub(super) fn from_codes(primaries: u8, transfer: u8) -> Result<Option<ColourSpa
         return Err(unsupported());
     }
     let name = match primaries {
+        5..=7 => "BT.601".to_owned(),
         9 => "BT.2020".to_owned(),
         11 => "DCI-P3".to_owned(),
         12 => "Display P3".to_owned(),
