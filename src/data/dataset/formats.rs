@@ -67,11 +67,8 @@ fn unread_note(root: &Path, listing: &Path) -> Option<String> {
     let fields = json::read(&file).ok();
     let is_list =
         |field: &&str| fields.as_ref().and_then(|all| all.get(*field)).is_some_and(Value::is_array);
-    let lists = if frame_lists::FIELDS.iter().any(|field| is_list(&field)) {
-        ", nor are its lists of views"
-    } else {
-        ""
-    };
+    let lists =
+        if frame_lists::FIELDS.iter().any(is_list) { ", nor are its lists of views" } else { "" };
     let name = transforms::SINGLE;
     Some(format!(
         "{name} is not read{lists}: {model} takes precedence unless you move it elsewhere"

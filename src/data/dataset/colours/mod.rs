@@ -55,6 +55,7 @@ pub(super) fn read(input: impl BufRead + Seek) -> Result<Option<ColourSpace>, Fa
         None => Ok(None),
         Some(Stated::Profile(bytes)) => profiles::from_icc(&bytes),
         Some(Stated::DamagedProfile) => Err(Fault::new("ICC profile", "it is damaged")),
+        Some(Stated::AdobeRgb) => profiles::adobe_rgb(),
         Some(Stated::Codes { primaries, transfer }) => profiles::from_codes(primaries, transfer),
         Some(Stated::Gamma { exponent, chromaticities }) => {
             profiles::from_gamma(exponent, chromaticities)

@@ -48,6 +48,11 @@ pub(super) fn from_icc(bytes: &[u8]) -> Result<Option<ColourSpace>, Fault> {
     unless_srgb(ICC, name, profile)
 }
 
+/// Adobe RGB (1998).
+pub(super) fn adobe_rgb() -> Result<Option<ColourSpace>, Fault> {
+    unless_srgb("EXIF", "Adobe RGB".to_owned(), ColorProfile::new_adobe_rgb())
+}
+
 /// The colour space of the codes in `cICP` (ITU-T H.273, tables 2 and 3). The curves of video cameras (BT.709, BT.601)
 /// count as sRGB, as in players: frames that FFmpeg extracts from videos state them.
 pub(super) fn from_codes(primaries: u8, transfer: u8) -> Result<Option<ColourSpace>, Fault> {
@@ -84,6 +89,7 @@ pub(super) fn from_codes(primaries: u8, transfer: u8) -> Result<Option<ColourSpa
         return Err(unsupported());
     }
     let name = match primaries {
+        5..=7 => "BT.601".to_owned(),
         9 => "BT.2020".to_owned(),
         11 => "DCI-P3".to_owned(),
         12 => "Display P3".to_owned(),

@@ -1,9 +1,11 @@
-//! Finds what an image file states about its colours: the chunks of a PNG, and the ICC profiles of PNG, JPEG and WebP.
+//! Finds what an image file states about its colours: chunks of PNG, EXIF of JPEG, and ICC profiles of PNG, JPEG and
+//! WebP.
 //!
 //! Only the parts before the pixels are read. A damaged file states nothing here; its decoder reports the damage.
 
 use std::io::{self, BufRead, Read, Seek};
 
+use exif::{In, Tag, Value};
 use flate2::read::ZlibDecoder;
 
 /// Largest ICC profile that is read `[bytes]`; those of cameras and monitors have a few hundred bytes to a megabyte.
@@ -19,6 +21,8 @@ pub(super) enum Stated {
     Profile(Vec<u8>),
     /// An ICC profile that cannot be unpacked.
     DamagedProfile,
+    /// Adobe RGB, by the `InteroperabilityIndex` in EXIF.
+    AdobeRgb,
     /// `cICP` of PNG: codes of the primaries and of the transfer function (ITU-T H.273, tables 2 and 3).
     Codes { primaries: u8, transfer: u8 },
     /// `gAMA` and `cHRM` of PNG.
@@ -105,13 +109,15 @@ fn unpacked(chunk: &[u8]) -> Stated {
     }
 }
 
-/// The profile is in one or several segments `APP2`, which may be in any order.
+/// The profile is in one or several segments `APP2`, which may be in any order; EXIF in `APP1` states Adobe RGB if there
+/// is no profile (DCF 2.0).
 fn jpeg(mut input: impl BufRead + Seek) -> Option<Stated> {
+    const APP1: u8 = 0xe1;
     const APP2: u8 = 0xe2;
     const SCAN: u8 = 0xda;
     const END: u8 = 0xd9;
     let mut parts: Vec<(u8, Vec<u8>)> = Vec::new();
-    let mut count = 0;
+    let (mut count, mut is_adobe_rgb) = (0, false);
     loop {
         let [mut marker] = bytes::<1>(&mut input)?;
         if marker != 0xff {
@@ -127,24 +133,36 @@ fn jpeg(mut input: impl BufRead + Seek) -> Option<Stated> {
             _ => {}
         }
         let length = u64::from(u16::from_be_bytes(bytes(&mut input)?)).checked_sub(2)?;
-        if marker != APP2 || length < 14 {
+        if !matches!(marker, APP1 | APP2) || length < 14 {
             input.seek_relative(length as i64).ok()?;
             continue;
         }
         let segment = data(&mut input, length)?;
-        if let Some([number, of, part @ ..]) = segment.strip_prefix(PART) {
+        if let Some(fields) = segment.strip_prefix(b"Exif\0\0") {
+            is_adobe_rgb |= states_adobe_rgb(fields);
+        } else if let Some([number, of, part @ ..]) = segment.strip_prefix(PART) {
             parts.push((*number, part.to_vec()));
             count = usize::from(*of);
         }
     }
     if parts.is_empty() {
-        return None;
+        return is_adobe_rgb.then_some(Stated::AdobeRgb);
     }
     parts.sort_by_key(|(number, _)| *number);
     let is_complete = parts.len() == count
         && parts.iter().zip(1..).all(|((number, _), expected)| usize::from(*number) == expected);
     let profile = parts.into_iter().flat_map(|(_, part)| part).collect();
     Some(if is_complete { Stated::Profile(profile) } else { Stated::DamagedProfile })
+}
+
+/// Returns true if EXIF names the colours that DCF 2.0 calls R03.
+fn states_adobe_rgb(fields: &[u8]) -> bool {
+    let fields = exif::Reader::new().read_raw(fields.to_vec()).ok();
+    let index = |fields: exif::Exif| {
+        let field = fields.get_field(Tag::InteroperabilityIndex, In::PRIMARY)?;
+        Some(matches!(&field.value, Value::Ascii(texts) if texts.iter().any(|text| text == b"R03")))
+    };
+    fields.and_then(index).unwrap_or(false)
 }
 
 /// The chunk `ICCP` precedes the pixels.

@@ -7,6 +7,7 @@ use image::codecs::png::PngEncoder;
 use image::codecs::webp::WebPEncoder;
 use image::{DynamicImage, ImageBuffer, ImageEncoder, ImageFormat, Luma, Rgb, RgbImage, Rgba};
 use moxcms::{ColorProfile, curve_from_gamma};
+use rand::{RngExt, SeedableRng};
 
 use super::super::images::{ImageSource, read_colours};
 use super::super::tests::{assert_noted, load};
@@ -89,6 +90,7 @@ fn srgb_from_p3(rgb: [u8; 3]) -> [u8; 3] {
 }
 
 fn assert_near(found: &[u8], expected: [u8; 3], tolerance: u8, case: &str) {
+    let found = &found[..3];
     let near = found.iter().zip(expected).all(|(a, b)| a.abs_diff(b) <= tolerance);
     assert!(near, "{case}: {found:?} instead of {expected:?}");
 }
@@ -262,5 +264,62 @@ fn truncated_files_state_nothing() {
         for at in 0..end {
             assert!(read(Cursor::new(&whole[..at])).unwrap().is_none(), "{at}");
         }
+    }
+}
+
+/// Profiles come from strangers.
+#[test]
+fn damaged_profiles_are_errors_or_read_but_never_panic() {
+    let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(7);
+    let whole = [
+        ColorProfile::new_display_p3().encode().unwrap(),
+        ColorProfile::new_gray_with_gamma(1.8).encode().unwrap(),
+    ];
+    for round in 0..400 {
+        let mut profile = whole[round % 2].clone();
+        for _ in 0..rng.random_range(1..4) {
+            let at = rng.random_range(0..profile.len());
+            profile[at] = rng.random();
+        }
+        profile.truncate(rng.random_range(profile.len() / 2..2 * profile.len()));
+        if let Ok(Some(colours)) = profiles::from_icc(&profile) {
+            let mut image = RgbImage::from_pixel(2, 2, Rgb([64, 200, 64])).into();
+            let _ = colours.convert(&mut image);
+        }
+    }
+}
+
+/// Cameras state Adobe RGB in EXIF, mostly without a profile.
+#[test]
+fn adobe_rgb_of_cameras_is_converted() {
+    let folder = tempfile::tempdir().unwrap();
+    let image = DynamicImage::from(RgbImage::from_pixel(16, 16, Rgb([100, 150, 100])));
+    let with_exif = |index: &[u8], jpeg: &[u8]| {
+        let value = exif::Value::Ascii(vec![index.to_vec()]);
+        let field = exif::Field {
+            tag: exif::Tag::InteroperabilityIndex,
+            ifd_num: exif::In::PRIMARY,
+            value,
+        };
+        let mut writer = exif::experimental::Writer::new();
+        writer.push_field(&field);
+        let mut tiff = Cursor::new(Vec::new());
+        writer.write(&mut tiff, false).unwrap();
+        let segment = [b"Exif\0\0", &tiff.into_inner()[..]].concat();
+        let length = (segment.len() as u16 + 2).to_be_bytes();
+        [&jpeg[..2], &[0xff, 0xe1], &length, &segment, &jpeg[2..]].concat()
+    };
+    let mut plain = Vec::new();
+    image.write_to(&mut Cursor::new(&mut plain), ImageFormat::Jpeg).unwrap();
+    let srgb = ColorProfile::new_srgb().encode().unwrap();
+    let tagged = tagged(&image, "jpg", &srgb);
+    // The values follow from the matrix in Adobe RGB (1998), version 2005-05, and gamma 563/256.
+    for (index, jpeg, expected) in [
+        (b"R03", &plain, [66, 151, 97]),
+        (b"R98", &plain, [100, 150, 100]),
+        (b"R03", &tagged, [100, 150, 100]),
+    ] {
+        let found = loaded(&folder, "jpg", &with_exif(index, jpeg));
+        assert_near(&found.rgb, expected, 3, &format!("{index:?}"));
     }
 }
