@@ -251,7 +251,6 @@ const TRANSFORMS: &[Replacement] = &[
     ),
     ("/ply_file_path", "\"../p.ply\"", "ply_file_path, `..`"),
     ("/ply_file_path", "\"p.ply\"", "ply_file_path, p.ply"),
-    ("/fl_x", "", "fl_x, camera_angle_x"),
     ("/fl_x", "0", "intrinsics, fx"),
     ("/w", "20.5", "w, 20.5"),
     ("/w", "-20", "w, -20"),
@@ -291,6 +290,8 @@ fn faults_of_transforms_json_are_named() {
     let long = format!("\"{}\"", "b".repeat(5000));
     let made = Made::transforms(|json| set(json, "/frames/1/file_path", &long));
     refused("long", &made, &options, "frames[1].file_path, 4 KiB");
+    let made = Made::transforms(|json| ["/fl_x", "/fl_y"].iter().for_each(|f| set(json, f, "")));
+    refused("no focal length", &made, &options, "fl_x, camera_angle_x");
     let made = Made::transforms(|json| {
         set(json, "/fl_x", "");
         set(json, "/camera_angle_x", "4.0");

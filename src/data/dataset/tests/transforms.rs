@@ -2,8 +2,7 @@
 
 use serde_json::{Value, json};
 
-use super::super::*;
-use super::{assert_noted, load, load_with, names, refused};
+use super::load;
 use densify_fixtures::Made;
 
 /// Axes that are uniformly scaled, as those of a scaled camera in Blender, change no pixel.
@@ -35,5 +34,44 @@ fn fisheyes_may_be_marked_by_a_number() {
     {
         let data = load(&Made::transforms(|json| json["is_fisheye"] = value.clone()));
         assert_eq!(data.train[0].source.undistortion.is_some(), is_fisheye, "{value}");
+    }
+}
+
+/// Each case has fields of the top level and of the second frame, and the focal lengths of that frame.
+#[test]
+fn focal_lengths_of_a_frame_override_those_at_the_top_level() {
+    let (x, y) = (10.0 / 0.5_f64.tan(), 6.0 / 0.4_f64.tan());
+    let degrees = 1.0_f64.to_degrees();
+    for (top, frame, expected) in [
+        (json!({"fl_x": 15, "fl_y": 16}), json!({}), (15.0, 16.0)),
+        (json!({"fl_x": 15}), json!({"camera_angle_x": 1.0}), (x, x)),
+        (json!({"fl_x": 15, "fl_y": 16}), json!({"camera_angle_x": 1.0}), (x, x)),
+        (json!({"fl_x": 15, "fl_y": 16}), json!({"fl_x": 12}), (12.0, 12.0)),
+        (json!({"fl_x": 15}), json!({"fl_y": 12}), (15.0, 12.0)),
+        (json!({"fl_y": 16}), json!({"fl_x": 12}), (12.0, 16.0)),
+        (json!({"camera_angle_x": 1.0}), json!({"fl_x": 12, "fl_y": 13}), (12.0, 13.0)),
+        (json!({"fl_x": 15, "camera_angle_x": 1.0}), json!({}), (15.0, 15.0)),
+        (json!({"fl_x": 15, "camera_angle_y": 0.8}), json!({}), (15.0, y)),
+        (json!({"camera_angle_y": 0.8}), json!({}), (y, y)),
+        (json!({"fl_y": 16}), json!({}), (16.0, 16.0)),
+        (json!({"x_fov": degrees}), json!({}), (x, x)),
+        (json!({"fl_x": 15}), json!({"x_fov": degrees, "camera_angle_y": 0.8}), (x, y)),
+    ] {
+        let data = load(&Made::transforms(|json| {
+            for field in ["fl_x", "fl_y"] {
+                json.as_object_mut().unwrap().remove(field);
+            }
+            for (field, value) in top.as_object().unwrap() {
+                json[field] = value.clone();
+            }
+            for index in 0..3 {
+                for (field, value) in frame.as_object().unwrap() {
+                    json["frames"][index][field] = value.clone();
+                }
+            }
+        }));
+        let camera = &data.train[1].camera;
+        let error = (camera.fx - expected.0).abs() + (camera.fy - expected.1).abs();
+        assert!(error < 1e-12, "{top}, {frame}: {}, {}", camera.fx, camera.fy);
     }
 }

@@ -27,6 +27,11 @@ const FISHEYE: &str = "OPENCV_FISHEYE";
 /// Name of the pinhole whose k4 to k6 are OpenCV's.
 const RATIONAL: &str = "FULL_OPENCV";
 
+/// Fields that state the horizontal focal length, in order of precedence: `[px]`, `[degrees]`, `[rad]`.
+const FOCAL_X: [&str; 3] = ["fl_x", "x_fov", "camera_angle_x"];
+/// Fields that state the vertical focal length, as in [`FOCAL_X`].
+const FOCAL_Y: [&str; 3] = ["fl_y", "y_fov", "camera_angle_y"];
+
 impl Fields<'_> {
     /// The image size that the intrinsics are for, if the file states it.
     fn size(&self) -> Result<Option<(u32, u32)>, LoadError> {
@@ -50,25 +55,49 @@ impl Fields<'_> {
                 ((header.width * k, header.height * k), Some(header))
             }
         };
-        let from_angle = |side: u32, angle: f64| 0.5 * f64::from(side) / (0.5 * angle).tan();
-        let fx = match (self.number("fl_x")?, self.number("camera_angle_x")?) {
-            (Some(fx), _) => fx,
-            (None, Some(angle)) => from_angle(width, angle),
-            (None, None) => {
-                return Err(self.fault("fl_x", "both fl_x and camera_angle_x are missing"));
-            }
-        };
-        let fy = match (self.number("fl_y")?, self.number("camera_angle_y")?) {
-            (Some(fy), _) => fy,
-            (None, Some(angle)) if self.inherited("fl_x").is_none() => from_angle(height, angle),
-            _ => fx,
-        };
+        let focal = self.focal((width, height))?;
         let cx = self.number("cx")?.unwrap_or(0.5 * f64::from(width));
         let cy = self.number("cy")?.unwrap_or(0.5 * f64::from(height));
-        let (focal, principal) = (DVec2::new(fx, fy), DVec2::new(cx, cy));
-        let lens = Lens::new((width, height), focal, principal, distortion);
+        let lens = Lens::new((width, height), focal, DVec2::new(cx, cy), distortion);
         check_lens(self.path, &self.full("intrinsics"), &lens)?;
         Ok((lens, header))
+    }
+
+    /// The focal lengths for an image of this size `[px]`. Those of the frame take precedence over those of the top
+    /// level, however they are stated. A single one holds for both axes.
+    fn focal(&self, (width, height): (u32, u32)) -> Result<DVec2, LoadError> {
+        let top = Self { frame: None, place: String::new(), ..*self };
+        let [own_x, top_x] = [self, &top].map(|level| level.own_focal(FOCAL_X, width));
+        let [own_y, top_y] = [self, &top].map(|level| level.own_focal(FOCAL_Y, height));
+        let (own_x, own_y, top_x, top_y) = (own_x?, own_y?, top_x?, top_y?);
+        let x = own_x.or(top_x);
+        // A frame that replaces the horizontal focal length alone replaces both.
+        let y = own_y.or(if top_x.is_some() { own_x } else { None }).or(top_y);
+        let problem = "no focal length: neither fl_x nor camera_angle_x is stated";
+        let either = x.or(y).ok_or_else(|| self.fault(FOCAL_X[0], problem))?;
+        Ok(DVec2::new(x.unwrap_or(either), y.unwrap_or(either)))
+    }
+
+    /// The focal length that the frame itself, or the top level, states in one of these fields: `[px]`, as a field of
+    /// view `[degrees]`, or as one `[rad]`.
+    fn own_focal(
+        &self,
+        [length, degrees, radians]: [&str; 3],
+        side: u32,
+    ) -> Result<Option<f64>, LoadError> {
+        let number = |field: &str| match self.own(field) {
+            None => Ok(None),
+            Some(_) => self.number(field),
+        };
+        let from_angle = |angle: f64| 0.5 * f64::from(side) / (0.5 * angle).tan();
+        if let length @ Some(_) = number(length)? {
+            return Ok(length);
+        }
+        let angle = match number(degrees)? {
+            Some(angle) => Some(angle.to_radians()),
+            None => number(radians)?,
+        };
+        Ok(angle.map(from_angle))
     }
 
     /// The lens model and its coefficients.
