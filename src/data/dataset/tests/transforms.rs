@@ -2,7 +2,7 @@
 
 use serde_json::{Value, json};
 
-use super::load;
+use super::{assert_noted, load};
 use densify_fixtures::Made;
 
 /// Axes that are uniformly scaled, as those of a scaled camera in Blender, change no pixel.
@@ -74,4 +74,36 @@ fn focal_lengths_of_a_frame_override_those_at_the_top_level() {
         let error = (camera.fx - expected.0).abs() + (camera.fy - expected.1).abs();
         assert!(error < 1e-12, "{top}, {frame}: {}, {}", camera.fx, camera.fy);
     }
+}
+
+#[test]
+fn fields_that_change_little_are_noted_and_unused_ones_are_not() {
+    let used = load(&Made::transforms(|json| {
+        json["rolling_shutter"] = json!([0.0, 0.0, 1.0]);
+        json["frames"][1]["transform_matrix_end"] = json["frames"][1]["transform_matrix"].clone();
+        json["sharpness_discard_threshold"] = 0.5.into();
+        json["sharpen"] = 1.into();
+        json["n_frames"] = 2.into();
+    }));
+    assert_eq!(used.train.len(), 3);
+    for words in [
+        "transforms.json: rolling_shutter is not honoured",
+        "transform_matrix_end",
+        "sharpness_discard_threshold",
+        "transforms.json: sharpen is",
+        "n_frames = 2, all 3 frames",
+    ] {
+        assert_noted(&used, words);
+    }
+    let unused = load(&Made::transforms(|json| {
+        json["rolling_shutter"] = json!([0.0, 0, 0.0, 0.0]);
+        json["sharpness_discard_threshold"] = 0.into();
+        json["n_frames"] = 3.into();
+        for field in ["equirectangular", "latlong", "white_transparent", "sharpen"] {
+            json[field] = false.into();
+        }
+        json["black_transparent"] = Value::Null;
+        json["ftheta_p0"] = 0.0.into();
+    }));
+    assert!(!unused.notes.iter().any(|note| note.contains("honoured")), "{:?}", unused.notes);
 }

@@ -27,6 +27,11 @@ const FISHEYE: &str = "OPENCV_FISHEYE";
 /// Name of the pinhole whose k4 to k6 are OpenCV's.
 const RATIONAL: &str = "FULL_OPENCV";
 
+/// The names of all supported camera models, for messages.
+pub(super) fn supported_models() -> String {
+    format!("{}, {FISHEYE}", PINHOLES.join(", "))
+}
+
 /// Fields that state the horizontal focal length, in order of precedence: `[px]`, `[degrees]`, `[rad]`.
 const FOCAL_X: [&str; 3] = ["fl_x", "x_fov", "camera_angle_x"];
 /// Fields that state the vertical focal length, as in [`FOCAL_X`].
@@ -109,8 +114,7 @@ impl Fields<'_> {
         };
         let is_fisheye = self.flag("is_fisheye")? || named == Some(FISHEYE);
         if let Some(model) = named.filter(|model| *model != FISHEYE && !PINHOLES.contains(model)) {
-            let supported = format!("{}, {FISHEYE}", PINHOLES.join(", "));
-            let field = self.full("camera_model");
+            let (field, supported) = (self.full("camera_model"), supported_models());
             return Err(LoadError::lens_model(self.path, &field, model, &supported));
         }
         let (plane, fields) = if is_fisheye {

@@ -9,6 +9,7 @@ mod fields;
 mod lens;
 mod matrix;
 mod named_files;
+mod not_honoured;
 
 use serde_json::Value;
 
@@ -117,6 +118,7 @@ fn read(
             return Err(top.fault(&format!("frames[{index}]"), "it is not an object"));
         };
         let fields = Fields { path: &path, place, frame: Some(entry), top: top.top };
+        fields.check_honoured()?;
         let Some(file) = fields.text("file_path")? else {
             return Err(fields.fault("file_path", "it is missing"));
         };
@@ -161,6 +163,7 @@ fn read(
         return Err(top.fault(field, problem));
     }
     let mut notes = lists.notes(name);
+    notes.extend(top.notes(list)?);
     if let Some(first) = missing.first() {
         let count = missing.len();
         notes.push(format!("{name}: {count} of {} frames have no image file and are skipped ({first} is the first)", list.len()));
