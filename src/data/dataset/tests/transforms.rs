@@ -2,7 +2,8 @@
 
 use serde_json::{Value, json};
 
-use super::{assert_noted, load};
+use super::super::*;
+use super::{assert_noted, load, load_with, names, refused};
 use densify_fixtures::Made;
 
 /// Axes that are uniformly scaled, as those of a scaled camera in Blender, change no pixel.
@@ -106,4 +107,54 @@ fn fields_that_change_little_are_noted_and_unused_ones_are_not() {
         json["ftheta_p0"] = 0.0.into();
     }));
     assert!(!unused.notes.iter().any(|note| note.contains("honoured")), "{:?}", unused.notes);
+}
+
+/// Moves the second frame to ScanNet++'s list of frames for tests.
+fn with_test_frames(json: &mut Value) {
+    let frame = json["frames"].as_array_mut().unwrap().remove(1);
+    json["test_frames"] = json!([frame]);
+}
+
+#[test]
+fn test_frames_are_held_out_and_bad_frames_left_out() {
+    let made = Made::transforms(with_test_frames);
+    let eval = LoadOptions { split: Split::Eval, ..LoadOptions::default() };
+    for options in [&LoadOptions::default(), &eval] {
+        let data = load_with(&made, options);
+        assert_eq!(names(&data.train), ["images/a.png", "images/c.png"]);
+        assert_eq!(names(&data.test), ["images/b.png"]);
+    }
+    // If every K-th view is held out by option, all frames are divided.
+    let every = Split::Every(std::num::NonZeroU32::new(3).unwrap());
+    let data = load_with(&made, &LoadOptions { split: every, ..LoadOptions::default() });
+    assert_eq!(names(&data.train), ["images/b.png", "images/c.png"]);
+    assert_eq!(names(&data.test), ["images/a.png"]);
+
+    let data = load(&Made::transforms(|json| {
+        json["frames"][0]["is_bad"] = false.into();
+        json["frames"][2]["is_bad"] = true.into();
+        json["test_frames"] = json!([]);
+    }));
+    assert_eq!((names(&data.train).len(), data.test.len()), (2, 0));
+    assert_noted(&data, "1 of 3 frames are marked is_bad, first: ./images/c.png");
+}
+
+#[test]
+fn contradicting_divisions_are_refused() {
+    let options = LoadOptions::default();
+    let made = Made::transforms(|json| {
+        with_test_frames(json);
+        json["train_filenames"] = json!(["images/a.png"]);
+    });
+    refused("lists", &made, &options, "test_frames, train_filenames divides, remove one");
+    let made = Made::transforms(|json| {
+        with_test_frames(json);
+        json["frames"][0] = json["test_frames"][0].clone();
+    });
+    refused("shared", &made, &options, "transforms.json, test_frames, images/b.png is in `frames`");
+    let made = Made::transforms(with_test_frames);
+    let text = std::fs::read(made.file("transforms.json")).unwrap();
+    made.write("transforms_train.json", &text);
+    made.write("transforms_test.json", &text);
+    refused("pair", &made, &options, "transforms_train.json, test_frames, transforms_test.json");
 }

@@ -7,9 +7,13 @@
 
 mod fields;
 mod lens;
+mod listing;
 mod matrix;
 mod named_files;
 mod not_honoured;
+
+use std::collections::HashSet;
+use std::path::PathBuf;
 
 use serde_json::Value;
 
@@ -44,7 +48,6 @@ pub(super) const FORMAT: DatasetFormat = DatasetFormat {
 const PAIR: [&str; 2] = ["transforms_train.json", "transforms_test.json"];
 pub(super) const SINGLE: &str = "transforms.json";
 
-const MAX_FRAMES: usize = 1_000_000;
 const REMEDY: &str = "correct the file or export it again";
 
 /// Reads `transforms_train.json` and `transforms_test.json`, with the tracks of a COLMAP model of the same scene.
@@ -83,7 +86,7 @@ enum DeclaredSplit {
     Train,
     /// All are for tests.
     Test,
-    /// The [lists](FrameLists) in the file.
+    /// The [lists](FrameLists) in the file, or its `test_frames`.
     InLists,
 }
 
@@ -100,24 +103,14 @@ fn read(
         return Err(LoadError::malformed(&path, "the file", "it is not a JSON object", REMEDY));
     };
     let top = Fields { path: &path, place: String::new(), frame: None, top: &top };
-    let Some(Value::Array(list)) = top.top.get("frames") else {
-        return Err(top.fault("frames", "the list is missing"));
-    };
-    if list.len() > MAX_FRAMES {
-        return Err(top.fault("frames", "there are more than a million"));
-    }
+    let listed = top.frames(declared)?;
     let mut lists = FrameLists::default();
     if declared == DeclaredSplit::InLists {
         top.frame_lists(folders, &mut lists)?;
     }
     let (mut frames, mut missing, mut fell_back) = (Vec::new(), Vec::new(), 0);
-    let mut first_missing = None;
-    for (index, entry) in list.iter().enumerate() {
-        let place = format!("frames[{index}].");
-        let Value::Object(entry) = entry else {
-            return Err(top.fault(&format!("frames[{index}]"), "it is not an object"));
-        };
-        let fields = Fields { path: &path, place, frame: Some(entry), top: top.top };
+    let (mut first_missing, mut bad) = (None, Vec::new());
+    for (fields, split) in &listed {
         fields.check_honoured()?;
         let Some(file) = fields.text("file_path")? else {
             return Err(fields.fault("file_path", "it is missing"));
@@ -125,11 +118,15 @@ fn read(
         let field = fields.full("file_path");
         let named = DataPath { file: &path, field: &field, value: file };
         let found = folders.image(named)?;
-        let (trained, tested) = match declared {
+        let (trained, tested) = match split {
             DeclaredSplit::Train => (true, false),
             DeclaredSplit::Test => (false, true),
             DeclaredSplit::InLists => lists.splits(file, found.as_ref()),
         };
+        if fields.flag("is_bad")? {
+            bad.push(file);
+            continue;
+        }
         let Some(found) = found else {
             first_missing.get_or_insert_with(|| folders.shown_path(named));
             missing.push(file.to_owned());
@@ -162,17 +159,27 @@ fn read(
     if let Some((field, problem)) = lists.fault() {
         return Err(top.fault(field, problem));
     }
+    let lists_tests = listed.iter().any(|(_, split)| *split != declared);
+    if lists_tests {
+        refuse_shared_images(&top, &frames)?;
+    }
     let mut notes = lists.notes(name);
-    notes.extend(top.notes(list)?);
+    notes.extend(top.notes(&listed)?);
     if let Some(first) = missing.first() {
         let count = missing.len();
-        notes.push(format!("{name}: {count} of {} frames have no image file and are skipped ({first} is the first)", list.len()));
+        notes.push(format!("{name}: {count} of {} frames have no image file and are skipped ({first} is the first)", listed.len()));
+    }
+    if let Some(first) = bad.first() {
+        let (count, all) = (bad.len(), listed.len());
+        notes.push(format!(
+            "{name}: {count} of {all} frames are marked is_bad and are left out (first: {first})"
+        ));
     }
     if fell_back > 0 {
         notes.push(folders.fell_back_note(fell_back));
     }
     let points_file = points_file((root, folders), &top, declared, &mut notes)?;
-    let (own_split, listing) = (lists.define_the_split(), path.clone());
+    let (own_split, listing) = (lists.define_the_split() || lists_tests, path.clone());
     let (notes, rest) = (text_notes(notes), Scene::default());
     let mut scene = Scene { frames, first_missing, notes, points_file, listing, own_split, ..rest };
     if declared != DeclaredSplit::Test
@@ -183,4 +190,14 @@ fn read(
         scene.notes.extend(note.map(Note::Text));
     }
     Ok(scene)
+}
+
+/// Refuses an image that is both trained on and tested on.
+fn refuse_shared_images(top: &Fields<'_>, frames: &[Frame]) -> Result<(), LoadError> {
+    let trained = frames.iter().filter(|frame| !frame.held_out);
+    let trained: HashSet<&PathBuf> = trained.map(|frame| &frame.image).collect();
+    let shared = frames.iter().find(|frame| frame.held_out && trained.contains(&frame.image));
+    shared.map_or(Ok(()), |frame| {
+        Err(top.fault("test_frames", format!("{} is in `frames`, too", frame.listed)))
+    })
 }

@@ -2,9 +2,10 @@
 //!
 //! Those that would spoil the model are refused, the others noted.
 
-use serde_json::{Map, Value};
+use serde_json::Value;
 
 use super::super::LoadError;
+use super::DeclaredSplit;
 use super::fields::Fields;
 use super::lens::supported_models;
 
@@ -52,22 +53,20 @@ impl Fields<'_> {
         Ok(())
     }
 
-    /// Notes about fields of the top level or of a frame in `list` that are not honoured.
-    pub(super) fn notes(&self, list: &[Value]) -> Result<Vec<String>, LoadError> {
+    /// Notes about fields of the top level or of a frame that are not honoured.
+    pub(super) fn notes(&self, listed: &[(Self, DeclaredSplit)]) -> Result<Vec<String>, LoadError> {
         let name = self.path.file_name().unwrap_or_default().display();
-        let is_set_in =
-            |object: &Map<String, Value>, field: &str| object.get(field).is_some_and(is_set);
         let is_used = |field: &str| {
-            let mut frames = list.iter().filter_map(Value::as_object);
-            is_set_in(self.top, field) || frames.any(|frame| is_set_in(frame, field))
+            let is_set = |level: &Self| level.own(field).is_some_and(is_set);
+            is_set(self) || listed.iter().any(|(frame, _)| is_set(frame))
         };
         let used = NOTED.iter().filter(|(field, _)| is_used(field));
         let mut notes: Vec<String> =
             used.map(|(field, lost)| format!("{name}: {field} is not honoured: {lost}")).collect();
         if let Some(count) = self.number("n_frames")?
-            && count < list.len() as f64
+            && count < listed.len() as f64
         {
-            let all = list.len();
+            let all = listed.len();
             notes.push(format!(
                 "{name}: n_frames = {count} is not honoured: all {all} frames are read"
             ));
