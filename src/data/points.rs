@@ -55,9 +55,9 @@ impl PointCloud {
     }
 }
 
-/// Reads the vertices of a PLY file as points; also returns a note if they have no colours. Other elements are skipped.
-/// Positions may be of any type and may be non-finite. The Gaussians of a splat model are read as points, in world
-/// coordinates even if the file has local ones.
+/// Reads the vertices of a PLY file as points; also returns a note if they have no colours, or are Gaussians. Other
+/// elements are skipped. Positions may be of any type and may be non-finite. The Gaussians of a splat model are read as
+/// points, in world coordinates even if the file has local ones.
 ///
 /// # Errors
 /// When the file is unreadable, contradicts itself, or its vertices have no x, y, z.
@@ -96,9 +96,19 @@ pub fn read_points(path: &Path) -> Result<(PointCloud, Option<String>), LoadErro
         });
     })?;
     let file = path.file_name().unwrap_or_default().to_string_lossy();
-    let is_grey = columns.len() == 3 && !points.is_empty();
-    let note =
-        is_grey.then(|| one_line(&format!("{file}: the points have no colours; they start grey")));
+    let note = if points.is_empty() {
+        None
+    } else if columns.len() == 3 {
+        Some("the points have no colours; they start grey")
+    } else if vertices.find(&["opacity"]).is_some() && vertices.find(&["scale_0"]).is_some() {
+        Some(
+            "this is a splat model, of which only positions and colours are used, as initial points; to continue its \
+             training, start from the model instead",
+        )
+    } else {
+        None
+    };
+    let note = note.map(|note| one_line(&format!("{file}: {note}")));
     Ok((points, note))
 }
 

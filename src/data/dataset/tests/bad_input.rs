@@ -253,6 +253,7 @@ const TRANSFORMS: &[Replacement] = &[
         "frames[1].transform_matrix, 4 rows of 4 numbers",
     ),
     ("/ply_file_path", "\"../p.ply\"", "ply_file_path, `..`"),
+    ("/ply_file_path", "\"images/a.png\"", "ply_file_path, a.png, not a PLY file, convert"),
     ("/ply_file_path", "\"p.ply\"", "ply_file_path, p.ply"),
     ("/fl_x", "0", "intrinsics, fx"),
     ("/w", "20.5", "w, 20.5"),

@@ -158,3 +158,29 @@ fn contradicting_divisions_are_refused() {
     made.write("transforms_test.json", &text);
     refused("pair", &made, &options, "transforms_train.json, test_frames, transforms_test.json");
 }
+
+#[test]
+fn initial_points_are_found_under_their_usual_names() {
+    for name in ["pointcloud.ply", "init.ply"] {
+        let made = Made::transforms(|json| json["ply_file_path"] = Value::Null);
+        assert!(load(&made).points.is_empty());
+        std::fs::rename(made.file("points.ply"), made.file(name)).unwrap();
+        let data = load(&made);
+        assert_eq!(data.points.len(), 200, "{name}");
+        assert_noted(&data, &format!("initial points are taken from {name}"));
+    }
+    // A PLY file may have any name.
+    let made = Made::transforms(|json| json["ply_file_path"] = "points.txt".into());
+    std::fs::rename(made.file("points.ply"), made.file("points.txt")).unwrap();
+    assert_eq!(load(&made).points.len(), 200);
+}
+
+#[test]
+fn a_splat_model_in_place_of_points_is_noted() {
+    let made = Made::transforms(|_| ());
+    let properties = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0"];
+    let properties = properties.map(|name| format!("property float {name}\n")).concat();
+    let header = format!("ply\nformat ascii 1.0\nelement vertex 1\n{properties}end_header\n");
+    made.write("points.ply", header + "1 2 3 0 0 0 0 -3\n");
+    assert_noted(&load(&made), "points.ply: this is a splat model, start from the model");
+}

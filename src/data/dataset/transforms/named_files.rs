@@ -1,5 +1,6 @@
 //! The files that the JSON names beside the photographs: masks and initial points.
 
+use std::io::Read;
 use std::path::{Path, PathBuf};
 
 use super::super::LoadError;
@@ -8,9 +9,14 @@ use super::super::mask_files::MaskFile;
 use super::super::paths::{DataPath, Root, relative};
 use super::DeclaredSplit;
 use super::fields::Fields;
+use densify_core::files;
 
-/// File names that 3DGS and nerfstudio use for initial points without naming them in the JSON.
-const POINT_FILES: [&str; 3] = ["points3d.ply", "sparse_pc.ply", "points3D.ply"];
+/// File names of initial points that the JSON need not name, in order of precedence: those of 3DGS, nerfstudio,
+/// LichtFeld Studio and Brush.
+const POINT_FILES: [&str; 5] =
+    ["points3d.ply", "sparse_pc.ply", "points3D.ply", "pointcloud.ply", "init.ply"];
+/// First bytes of every PLY file.
+const PLY: &[u8] = b"ply";
 
 /// The file of the initial points: the one named in the JSON, or one of [`POINT_FILES`].
 pub(super) fn points_file(
@@ -24,20 +30,34 @@ pub(super) fn points_file(
         if folders.folder_for_absolute(value).is_none() {
             let missing =
                 || top.fault("ply_file_path", format!("the file {value:?} does not exist"));
-            return Ok(Some(root.existing_on_any_system(named)?.ok_or_else(missing)?));
+            let found = root.existing_on_any_system(named)?.ok_or_else(missing)?;
+            return check_is_ply(named, &found).map(|()| Some(found));
         }
         // The path is from another machine; the file may have been copied along with the photographs.
         for value in named.suffixes()? {
             if let Some(found) = root.existing(DataPath { value: &value, ..named })? {
-                return Ok(Some(found));
+                return check_is_ply(named, &found).map(|()| Some(found));
             }
         }
         let file = top.path.file_name().unwrap_or_default().display();
-        notes.push(densify_core::files::one_line(&format!(
+        notes.push(files::one_line(&format!(
             "{file}: the initial points {value:?} are not in the dataset's folder and are left out"
         )));
     }
     if declared == DeclaredSplit::Test { Ok(None) } else { usual_points(root, top.path, notes) }
+}
+
+/// Refuses initial points of another format, which cannot be read even if they are whole.
+fn check_is_ply(named: DataPath<'_>, found: &Path) -> Result<(), LoadError> {
+    let is_named_ply = found.extension().is_some_and(|name| name.eq_ignore_ascii_case("ply"));
+    let mut start = Vec::new();
+    let file = files::open(found).map_err(LoadError::io(found))?;
+    file.take(PLY.len() as u64).read_to_end(&mut start).map_err(LoadError::io(found))?;
+    if is_named_ply || start == PLY {
+        return Ok(());
+    }
+    let problem = format!("{:?} is not a PLY file", named.value);
+    Err(LoadError::malformed(named.file, named.field, problem, "convert the points to PLY"))
 }
 
 /// The file of initial points under one of the [usual names](POINT_FILES), for pose files that name none.
