@@ -51,8 +51,7 @@ impl Undistortion {
             // Every point was seen by construction; rounding must not make holes at the border.
             return self.from.extrapolate(ray);
         }
-        let is_in_image = |at: &DVec2| (at.cmpge(DVec2::ZERO) & at.cmple(self.from.size())).all();
-        self.from.project(ray).filter(is_in_image)
+        self.from.project(ray).filter(|at| self.from.images(*at, 0.0))
     }
 
     /// Resamples an image of the lens in one row-major pass.

@@ -24,7 +24,7 @@ pub(crate) use projection::Projection;
 /// are x right, y down, z forward.
 ///
 /// The `Debug` text of lenses is part of the fingerprint in checkpoints: renaming a field would invalidate them.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Clone, Copy, PartialEq)]
 pub(crate) struct Lens {
     /// Image width `[px]`.
     pub(crate) width: u32,
@@ -42,6 +42,9 @@ pub(crate) struct Lens {
     /// True if the distortion folds over beyond `reach`, so that different rays meet in one pixel; false if the
     /// projection ends there.
     folds: bool,
+    /// Radius of the circle around the middle of the image outside of which nothing was imaged `[px]`; `None`: the
+    /// whole image counts.
+    circle: Option<f64>,
 }
 
 /// Reason why a pixel has no ray.
@@ -51,6 +54,8 @@ pub(crate) enum Unseen {
     Folds,
     /// The angle from the axis exceeds the largest supported angle.
     TooWide,
+    /// The pixel is outside of the image circle.
+    OutsideCircle,
 }
 
 impl Lens {
@@ -65,7 +70,13 @@ impl Lens {
         let reach = distortion.invertible_radius(limit);
         // The factor allows for the rounding of a square root. A limit of NaN gives false.
         let is_whole = reach >= limit * (1.0 - 1e-12);
-        Self { width, height, focal, principal, distortion, reach, folds: !is_whole }
+        Self { width, height, focal, principal, distortion, reach, folds: !is_whole, circle: None }
+    }
+
+    /// The same lens, of whose image only a circle around the middle counts; `radius` is in pixels.
+    pub(crate) fn with_circle(self, radius: f64) -> Self {
+        let is_partial = radius < 0.5 * self.size().length();
+        Self { circle: is_partial.then_some(radius), ..self }
     }
 
     /// Returns true if the lens differs from a pinhole.
@@ -95,7 +106,20 @@ impl Lens {
             f64::from(height) / f64::from(self.height),
         );
         let (focal, principal) = (self.focal * scale, self.principal * scale);
-        Self { width, height, focal, principal, ..*self }
+        let circle = self.circle.map(|radius| radius * scale.min_element());
+        Self { width, height, focal, principal, circle, ..*self }
+    }
+
+    /// Returns true if a point `[px]` is in the image, and in its circle; `tolerance` is for rounding `[px]`.
+    pub(crate) fn images(&self, pixel: DVec2, tolerance: f64) -> bool {
+        let low = DVec2::splat(-tolerance);
+        (pixel.cmpge(low) & pixel.cmple(self.size() - low)).all()
+            && self.is_in_circle(pixel, tolerance)
+    }
+
+    fn is_in_circle(&self, pixel: DVec2, tolerance: f64) -> bool {
+        let distance = (pixel - 0.5 * self.size()).length();
+        self.circle.is_none_or(|radius| distance <= radius + tolerance)
     }
 
     /// Image size `[px]`.
@@ -138,6 +162,9 @@ impl Lens {
     /// # Errors
     /// When no such ray is known.
     pub(crate) fn unproject(&self, pixel: DVec2) -> Result<DVec3, Unseen> {
+        if !self.is_in_circle(pixel, 0.0) {
+            return Err(Unseen::OutsideCircle);
+        }
         let target = (pixel - self.principal) / self.focal;
         let unseen = if self.folds { Unseen::Folds } else { Unseen::TooWide };
         let p = self.distortion.inverse(target, self.reach).ok_or(unseen)?;
@@ -147,6 +174,21 @@ impl Lens {
         let radius = p.length();
         let (sine, cosine) = self.distortion.plane.angle(radius).sin_cos();
         Ok(if radius > 0.0 { (p * (sine / radius)).extend(cosine) } else { DVec3::Z })
+    }
+}
+
+impl fmt::Debug for Lens {
+    /// The fields; the circle only if there is one.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let mut fields = f.debug_struct("Lens");
+        fields.field("width", &self.width).field("height", &self.height);
+        fields.field("focal", &self.focal).field("principal", &self.principal);
+        fields.field("distortion", &self.distortion);
+        fields.field("reach", &self.reach).field("folds", &self.folds);
+        if let Some(circle) = self.circle {
+            fields.field("circle", &circle);
+        }
+        fields.finish()
     }
 }
 

@@ -70,8 +70,9 @@ impl Pinholes {
         if !keep_fov && seen.iter().any(|(_, ray)| *ray == Err(Unseen::Folds)) {
             return Err(PinholeError::Folds(lens.usable_field()));
         }
-        let rays = || seen.iter().filter_map(|(_, ray)| ray.ok());
-        let is_whole = rays().count() == seen.len();
+        let rim = rim(lens);
+        let rays = || seen.iter().filter_map(|(_, ray)| ray.ok()).chain(rim.iter().copied());
+        let is_whole = seen.iter().all(|(_, ray)| ray.is_ok());
         let perspective = lens.distortion.plane == Projection::Perspective;
         let steepest = if perspective { STEEPEST_PERSPECTIVE } else { STEEPEST };
         // A little less than the cosine of the largest angle that projections through tan θ support.
@@ -102,8 +103,9 @@ impl Pinholes {
             return Err(PinholeError::NothingVisible);
         }
         let shown = |ray: DVec3| faces.iter().any(|(_, face)| face.shows(ray));
-        let lost = seen.iter().filter(|(_, ray)| !ray.is_ok_and(shown)).count();
-        let cropped = lost as f64 / seen.len() as f64;
+        let imaged = || seen.iter().filter(|(_, ray)| *ray != Err(Unseen::OutsideCircle));
+        let lost = imaged().filter(|(_, ray)| !ray.is_ok_and(shown)).count();
+        let cropped = lost as f64 / imaged().count() as f64;
         Ok(Self { faces, cropped })
     }
 }
@@ -127,6 +129,18 @@ fn grid(lens: &Lens) -> Vec<(DVec2, Result<DVec3, Unseen>)> {
     let places = (0..=SAMPLES).flat_map(|y| (0..=SAMPLES).map(move |x| (x, y)));
     let places = places.map(|(x, y)| lens.size() * DVec2::new(f64::from(x), f64::from(y)) / side);
     places.map(|place| (place, lens.unproject(place))).collect()
+}
+
+/// The rays of points on the rim of the image circle, which the grid may miss; none without a circle.
+fn rim(lens: &Lens) -> Vec<DVec3> {
+    let Some(radius) = lens.circle else { return Vec::new() };
+    let points = (0..4 * SAMPLES).map(|step| {
+        let angle = f64::from(step) / f64::from(4 * SAMPLES) * std::f64::consts::TAU;
+        // Rounding must not move a point out of the circle.
+        0.5 * lens.size() + DVec2::from_angle(angle) * (radius * (1.0 - 1e-9))
+    });
+    let inside = points.filter(|point| lens.images(*point, 0.0));
+    inside.filter_map(|point| lens.unproject(point).ok()).collect()
 }
 
 /// The rectangle between the innermost points of the four borders; `None` if it excludes the axis or a point has no
@@ -161,8 +175,7 @@ fn visible_part(
     let is_seen = |x, y| {
         let pixel = lens.project(turn * at(x, y).extend(1.0));
         // The ray of a border pixel is projected back to the border up to rounding.
-        let inside = |p: DVec2| (p.cmpge(DVec2::splat(-1e-6)) & p.cmple(lens.size() + 1e-6)).all();
-        pixel.is_some_and(inside)
+        pixel.is_some_and(|pixel| lens.images(pixel, 1e-6))
     };
     let row = CELLS + 1;
     let corners: Vec<bool> = (0..row * row).map(|i| is_seen(i % row, i / row)).collect();

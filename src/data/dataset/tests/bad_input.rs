@@ -266,6 +266,7 @@ const TRANSFORMS: &[Replacement] = &[
     ("/ftheta_p1", "0.001", "transforms.json, ftheta_p1, f-theta, fisheye model"),
     ("/white_transparent", "true", "white_transparent, transparent in the images"),
     ("/black_transparent", "true", "black_transparent, transparent in the images"),
+    ("/fisheye_crop_radius", "5", "fisheye_crop_radius, not a fisheye, masks/"),
     ("/is_fisheye", "\"false\"", "transforms.json, is_fisheye, neither true nor false"),
     ("/is_fisheye", "2", "transforms.json, is_fisheye, neither true nor false"),
     ("/k4", "0.08", "transforms.json, k4, 0.08, two meanings, FULL_OPENCV, undistort"),

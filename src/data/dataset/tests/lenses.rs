@@ -187,3 +187,50 @@ fn views_that_a_mask_hides_are_named_and_left_out() {
         assert!(view.source.load().unwrap().mask.unwrap().iter().any(|&weight| weight > 0));
     }
 }
+
+/// What lies outside of nerfstudio's `fisheye_crop_radius` is cropped or, on request, masked: here, it is white, and
+/// the circle is black.
+#[test]
+fn nothing_outside_of_the_image_circle_is_used() {
+    const RADIUS: f64 = 5.0;
+    let made = |radius: Option<f64>| {
+        let made = Made::transforms(|json| {
+            json["camera_model"] = "OPENCV_FISHEYE".into();
+            json["fl_y"] = 15.0.into();
+            json["fisheye_crop_radius"] = radius.into();
+        });
+        for name in NAMES {
+            let is_inside = |x: u32, y: u32| {
+                let offset = [f64::from(x) + 0.5 - 10.0, f64::from(y) + 0.5 - 6.0];
+                // Interpolation reaches two pixels beyond a point.
+                offset[0].hypot(offset[1]) < RADIUS + 3.0
+            };
+            let pixel = |x, y| [if is_inside(x, y) { 0 } else { 255 }; 3].into();
+            let image = image::RgbImage::from_fn(SIZE.0, SIZE.1, pixel);
+            image.save(made.file("images").join(name)).unwrap();
+        }
+        made
+    };
+    let largest = |image: &densify_core::image::Image8| {
+        let weight = |index| image.mask.as_ref().map_or(255, |mask| mask[index]);
+        let pixels = image.rgb.chunks_exact(3).enumerate();
+        pixels.filter(|(index, _)| weight(*index) > 0).map(|(_, pixel)| pixel[0]).max().unwrap()
+    };
+    for keep_fov in [false, true] {
+        let options = LoadOptions { keep_fov, ..LoadOptions::default() };
+        for (radius, is_cut) in [(None, false), (Some(RADIUS), true), (Some(12.0), false)] {
+            let made = made(radius);
+            let data = load_with(&made, &options);
+            let source = &data.train[0].source;
+            assert_eq!(format!("{:?}", source.undistortion).contains("circle"), is_cut);
+            let image = source.load().unwrap();
+            assert_eq!(largest(&image) == 0, is_cut, "{keep_fov}, {radius:?}");
+            assert_eq!(image.mask.is_some(), keep_fov, "{radius:?}");
+            // At half the resolution, the circle has half the radius.
+            let resolution = Some(Resolution::Divisor(2));
+            let data = load_with(&made, &LoadOptions { resolution, ..options.clone() });
+            let image = data.train[0].source.load().unwrap();
+            assert_eq!(largest(&image) == 0, is_cut, "half, {keep_fov}, {radius:?}");
+        }
+    }
+}

@@ -65,7 +65,22 @@ impl Fields<'_> {
         let cy = self.number("cy")?.unwrap_or(0.5 * f64::from(height));
         let lens = Lens::new((width, height), focal, DVec2::new(cx, cy), distortion);
         check_lens(self.path, &self.full("intrinsics"), &lens)?;
-        Ok((lens, header))
+        Ok((self.with_circle(lens)?, header))
+    }
+
+    /// The lens with the image circle that the file states.
+    fn with_circle(&self, lens: Lens) -> Result<Lens, LoadError> {
+        const FIELD: &str = "fisheye_crop_radius";
+        let Some(radius) = self.number(FIELD)? else { return Ok(lens) };
+        if lens.distortion.plane != Projection::Equidistant {
+            let remedy = "remove it, and hide what lies outside of the circle by masks in `masks/`";
+            let problem = "the lens is not a fisheye";
+            return Err(LoadError::malformed(self.path, self.full(FIELD), problem, remedy));
+        }
+        if radius >= 1.0 {
+            return Ok(lens.with_circle(radius));
+        }
+        Err(self.fault(FIELD, format!("{radius} px is less than 1 px")))
     }
 
     /// The focal lengths for an image of this size `[px]`. Those of the frame take precedence over those of the top
