@@ -29,7 +29,7 @@
 //! | 20 distant, tiny, huge | selftest; `src/data/dataset/normalise.rs: powers_of_two_change_no_bit_of_the_scene`; `src/data/dataset/normalise.rs: models_go_to_the_world_and_back`; `src/data/dataset/tests/formats.rs: a_far_off_scene_keeps_its_precision` |
 //! | 21 image sizes | selftest; `src/data/dataset/images.rs: broken_and_oversized_files_are_errors_that_name_them` |
 //! | 22 lenses | selftest; `src/data/dataset/pose.rs: fields_of_view_that_no_pinhole_has_are_refused` |
-//! | 23 plain photographs | selftest; `src/data/dataset/images.rs: every_colour_type_packs_to_eight_bits`; `policies/src/taming/score.rs: terms_are_relative_to_the_median_of_the_positive`; `policies/src/conformance/tests.rs: every_registered_policy_conforms` |
+//! | 23 plain photographs | selftest; `src/data/dataset/images.rs: every_colour_type_packs_to_eight_bits`; `policies/src/taming/score.rs: terms_are_relative_to_the_median_of_the_positive_values`; `policies/src/conformance/tests.rs: every_registered_policy_conforms` |
 //! | 24 similarity | selftest; `src/train/metrics/ssim.rs: nearly_equal_flat_images_do_not_exceed_one`; `src/train/metrics/ssim.rs: agrees_with_the_textbook_pixel_by_pixel_at_every_size` |
 //! | 25 the optimiser | selftest; `tests/it/declared.rs: steps_use_the_gradients_accumulated_since_the_last_step`; `tests/it/agreement.rs: training_steps_match_the_native_backend` |
 //! | 26 poisoned rows | selftest; `tests/it/quarantine.rs: every_non_finite_value_is_found`; `src/train/trainer/tests/nonfinite.rs: nonfinite_rows_are_removed_before_the_policy_plans` |

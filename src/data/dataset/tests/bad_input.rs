@@ -261,7 +261,7 @@ const TRANSFORMS: &[Replacement] = &[
     ("/camera_model", "\"EQUIRECTANGULAR\"", "camera_model, EQUIRECTANGULAR, faces of a cube"),
     ("/camera_model", "\"VR180_L\"", "camera_model, VR180_L, image_undistorter"),
     ("/camera_model", "7", "camera_model, string"),
-    ("/equirectangular", "true", "transforms.json, equirectangular, EQUIRECTANGULAR, cube"),
+    ("/equirectangular", "true", "transforms.json: equirectangular: the, EQUIRECTANGULAR, cube"),
     ("/frames/2/latlong", "true", "frames[2].latlong, EQUIRECTANGULAR, faces of a cube"),
     ("/ftheta_p1", "0.001", "transforms.json, ftheta_p1, f-theta, fisheye model"),
     ("/white_transparent", "true", "white_transparent, transparent in the images"),

@@ -21,7 +21,11 @@ pub(super) struct Fields<'a> {
 }
 
 impl<'a> Fields<'a> {
+    /// The place of a field for messages: at the top level if it is only there, else in the frame.
     pub(super) fn full(&self, field: &str) -> String {
+        if self.own(field).is_none() && self.inherited(field).is_some() {
+            return field.to_owned();
+        }
         format!("{}{field}", self.place)
     }
 
