@@ -221,7 +221,8 @@ run_spec! {
         memory: Option<ByteCount> = None, Fixed, value "BYTES";
 
         /// Maximum number of (Gaussian, tile) pairs in memory; views with more are processed in bands, which is exact
-        /// but slower (default: 16 per Gaussian of the budget, on a GPU fewer for large models, or chosen for --memory)
+        /// but slower (default: 16 per Gaussian of the budget, on a GPU fewer for large models, or chosen for
+        /// --memory)
         tile_cap: Option<Rows> = None, Free, value "PAIRS";
 
         /// Memory for decoded photographs, and the same amount on a GPU; the other photographs are decoded and uploaded
