@@ -66,6 +66,7 @@ use loss::{ErrorRequests, LossBuffers};
 use mask::Masks;
 use moments::Moments;
 use parameters::Parameters;
+#[cfg(feature = "gpu")]
 pub(crate) use parameters::{MEANS, narrowed, widened};
 use passes::{for_each_pixel, scalars};
 use project::Splat;

@@ -33,6 +33,7 @@ const fn fractional_bits(bounded: usize) -> u32 {
 }
 
 /// A parameter that is no mean, counted as in [`ModelArray`](densify_core::gaussians::ModelArray), rounded to its 16 bits.
+#[cfg(feature = "gpu")]
 pub(crate) fn narrowed(parameter: usize, x: f32) -> u16 {
     match parameter.checked_sub(plane::SH) {
         None => fixed::nearest(x, fractional_bits(parameter - MEANS)).cast_unsigned(),
@@ -41,6 +42,7 @@ pub(crate) fn narrowed(parameter: usize, x: f32) -> u16 {
 }
 
 /// The inverse of [`narrowed`].
+#[cfg(feature = "gpu")]
 pub(crate) fn widened(parameter: usize, bits: u16) -> f32 {
     match parameter.checked_sub(plane::SH) {
         None => fixed::to_f32(bits.cast_signed(), fractional_bits(parameter - MEANS)),
