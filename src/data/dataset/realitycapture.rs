@@ -170,7 +170,7 @@ fn read(root: &Root, options: &LoadOptions) -> Result<Option<Scene>, LoadError> 
 }
 
 /// Returns true if x and y can be degrees and vary far less than the height. A degree is 111 km; in metres, such cameras
-/// would be a vertical line, from which nothing can be reconstructed.
+/// would be a vertical line far from the origin of local coordinates.
 fn are_degrees(frames: &[Frame]) -> bool {
     /// Largest spread of longitudes and latitudes: 11 km.
     const MAX_SPREAD: f64 = 0.1;
@@ -184,7 +184,9 @@ fn are_degrees(frames: &[Frame]) -> bool {
         .fold(empty, |(low, high), centre| (low.min(centre), high.max(centre)));
     let (farthest, spread) = (low.abs().max(high.abs()), high - low);
     let wide = spread.x.max(spread.y);
-    farthest.x <= 180.0 && farthest.y <= 90.0 && wide < MAX_SPREAD && spread.z > RATIO * wide
+    let can_be_degrees = farthest.x <= 180.0 && farthest.y <= 90.0;
+    let is_local = farthest.x.max(farthest.y) < 1.0 || wide == 0.0;
+    can_be_degrees && !is_local && wide < MAX_SPREAD && spread.z > RATIO * wide
 }
 
 /// Column names in lower case; those of RealityScan 2 are replaced with the older ones.

@@ -38,10 +38,11 @@ impl Buffers {
     pub(super) fn resize(&mut self, device: &Device, sizes: &Sizes) -> Result<(), BackendError> {
         let planned = sizes.planned();
         check_sizes(device, &planned, sizes)?;
-        let changed: Vec<_> = planned
+        let mut changed: Vec<_> = planned
             .into_iter()
             .filter(|p| self.named.get(p.name).is_none_or(|b| b.size() != p.bytes))
             .collect();
+        changed.sort_by_key(|planned| std::cmp::Reverse(planned.bytes));
         for p in &changed {
             if let Some(old) = self.named.remove(p.name) {
                 old.destroy();
@@ -97,23 +98,30 @@ fn create(device: &wgpu::Device, planned: &PlannedBuffer) -> Buffer {
     })
 }
 
-/// Fails if a buffer or range is larger than the device can bind: a driver may accept it and fail later.
+/// Fails if a buffer or range is larger than the device can bind, or the scratch buffer larger than it can allocate: a
+/// driver may accept it and fail later.
 fn check_sizes(
     device: &Device,
     planned: &[PlannedBuffer],
     sizes: &Sizes,
 ) -> Result<(), BackendError> {
-    let most = device.largest_binding();
-    // No kernel binds the whole of these two, which are no larger than the device's largest buffer.
+    // No kernel binds the whole of these two; that of photographs is planned within the device's largest buffer.
     let bound_buffers = planned.iter().filter(|p| !["photographs", SCRATCH].contains(&p.name));
     let bound_buffers = bound_buffers.map(|p| (p.name, p.line, p.bytes));
     let ranges = sizes.ranges().into_iter().map(|range| (range.name, range.line, range.bytes));
     let worst = bound_buffers.chain(ranges).max_by_key(|(.., bytes)| *bytes);
-    let Some((name, buffer, bytes)) = worst.filter(|(.., bytes)| *bytes > most) else {
+    let scratch = planned.iter().find(|p| p.name == SCRATCH).map(|p| (p.name, p.line, p.bytes));
+    let limits = [(worst, device.largest_binding()), (scratch, device.summary.largest_buffer)];
+    let too_large = limits.into_iter().find_map(|(buffer, most)| {
+        buffer.filter(|(.., bytes)| *bytes > most).map(|buffer| (buffer, most))
+    });
+    let Some(((name, buffer, bytes), most)) = too_large else {
         return Ok(());
     };
     let fit = match name {
-        "records" | "list" | "keys 0" | "sums" => Fit::TileCap(most / (bytes / sizes.cap).max(1)),
+        "records" | "list" | "keys 0" | "keys 1" | "values" | "row of slot" | "sums" | SCRATCH => {
+            Fit::TileCap(most / bytes.div_ceil(sizes.cap).max(1))
+        }
         "canvas" | "finish" | "pixel gradient" | "derivatives" => Fit::ImageSize,
         _ => Fit::Budget(device.summary.largest_budget(sizes.sh_degree)),
     };

@@ -114,8 +114,8 @@ impl GpuBackend {
 }
 
 impl GpuDevice {
-    /// Compares the device with the native backend, once per set of kernels that a policy's needs require. Afterwards
-    /// the memory of the process includes the driver's.
+    /// Compares the device with the native backend, once per set of kernels that a policy's needs require, with
+    /// parameters and moments in f32. Afterwards the memory of the process includes the driver's.
     ///
     /// # Errors
     /// As [`GpuBackend::new`].

@@ -215,6 +215,11 @@ impl Device {
         }
     }
 
+    /// Notes that the device has executed all commands, and so has taken everything written before.
+    pub(super) fn uploads_are_done(&self) {
+        *self.written.lock().unwrap_or_else(PoisonError::into_inner) = 0;
+    }
+
     /// Runs `create` and returns the errors that the device reports meanwhile; `what` and `bytes` describe the result.
     pub(super) fn guarded<T>(
         &self,
@@ -364,6 +369,23 @@ mod tests {
         let found = [uploaded, reserved().unwrap_or(0)];
         assert!(found.iter().all(|bytes| *bytes <= promised), "{found:?} of {promised}");
         assert!(found[1] > promised / 2, "{found:?} of {promised}");
+    }
+
+    /// Lists that are too long name the longest that fit, not a smaller budget.
+    #[test]
+    fn tile_lists_beyond_a_limit_of_the_device_name_the_largest_cap() {
+        let Some(device) = software_device() else { return };
+        let pairs = |bytes: u64| usize::try_from(bytes / 4).expect("64 bits");
+        let summary = device.adapter();
+        let beyond_binding = pairs(summary.largest_binding.min(summary.largest_buffer)) + 1;
+        for tile_cap in [beyond_binding, pairs(summary.largest_buffer)] {
+            let setup = Setup { tile_cap: Some(tile_cap), ..Setup::new(2) };
+            let refused = GpuBackend::new(&model().0, &setup, &device).map(|_| ());
+            let Err(BackendError::BufferTooLarge { fit: Fit::TileCap(fit), .. }) = refused else {
+                panic!("{tile_cap} pairs: {refused:?}");
+            };
+            assert!(fit > 0 && fit < tile_cap as u64, "{fit} instead of {tile_cap}");
+        }
     }
 
     #[test]

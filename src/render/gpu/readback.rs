@@ -38,6 +38,7 @@ pub(super) fn finish(
     // `get_mapped_range` reports failures.
     slice.map_async(MapMode::Read, |_| ());
     device.device.poll(PollType::wait_indefinitely()).map_err(|e| device.failed(e.to_string()))?;
+    device.uploads_are_done();
     device.check()?;
     let copied = slice.get_mapped_range().map_err(|e| device.failed(e.to_string()))?.to_vec();
     staging.unmap();

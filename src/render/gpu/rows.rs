@@ -169,13 +169,15 @@ impl RowArray {
     /// The inverse of [`words_of`](Self::words_of).
     pub(super) fn parameters_of(&self, words: &[u32]) -> Vec<f32> {
         let (wide, count) = (self.wide(), self.parameters.len());
-        let of_row = |row: &[u32]| {
+        let first = self.parameters.start + wide;
+        let rows = words.chunks_exact(self.numbers);
+        let mut parameters = Vec::with_capacity(rows.len() * count);
+        for row in rows {
             let code = |i: usize| (row[wide + i / 2] >> (16 * (i % 2))) as u16;
-            let first = self.parameters.start + wide;
-            let narrow = (0..count - wide).map(|i| widened(first + i, code(i)));
-            row[..wide].iter().map(|&bits| f32::from_bits(bits)).chain(narrow).collect::<Vec<_>>()
-        };
-        words.chunks_exact(self.numbers).flat_map(of_row).collect()
+            parameters.extend(row[..wide].iter().map(|&bits| f32::from_bits(bits)));
+            parameters.extend((0..count - wide).map(|i| widened(first + i, code(i))));
+        }
+        parameters
     }
 
     /// Distance between rows, and between the numbers of a row, in an array of this number of rows.

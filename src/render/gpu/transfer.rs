@@ -30,20 +30,11 @@ impl GpuBackend {
 
     pub(super) fn upload(&self, model: &Gaussians) {
         for array in self.sizes.parameters() {
-            let mut values = Vec::with_capacity(array.parameters.len() * model.len());
-            for i in 0..model.len() {
-                if array.content == Content::Geometry {
-                    values.extend_from_slice(&model.means[i]);
-                    values.extend_from_slice(&model.log_scales[i]);
-                    values.extend_from_slice(&model.quats[i]);
-                    values.push(model.opacity_logits[i]);
-                } else {
-                    let Range { start, end } = array.parameters;
-                    let first = ModelArray::Sh.parameters(model.sh_degree).start;
-                    values.extend_from_slice(&model.sh_of(i)[start - first..end - first]);
-                }
+            for piece in pieces(model.len()) {
+                let first = 4 * (piece.start * array.numbers) as u64;
+                let values = gather(model, array, piece);
+                self.write_at(array.name, first, &array.words_of(&values));
             }
-            self.write(array.name, bytemuck::cast_slice(&array.words_of(&values)));
         }
     }
 
@@ -256,4 +247,22 @@ fn overlap(a: &Range<usize>, b: &Range<usize>) -> Option<(Range<usize>, Range<us
 pub(super) fn stored_rows(first: u64, rows: &Range<usize>) -> (u64, usize) {
     let stored = (first as usize).clamp(rows.start, rows.end);
     ((stored as u64).saturating_sub(first), stored - rows.start)
+}
+
+/// The parameters of an array for some rows of a model, row by row.
+fn gather(model: &Gaussians, array: &RowArray, rows: Range<usize>) -> Vec<f32> {
+    let mut values = Vec::with_capacity(array.parameters.len() * rows.len());
+    for row in rows {
+        if array.content == Content::Geometry {
+            values.extend_from_slice(&model.means[row]);
+            values.extend_from_slice(&model.log_scales[row]);
+            values.extend_from_slice(&model.quats[row]);
+            values.push(model.opacity_logits[row]);
+        } else {
+            let Range { start, end } = array.parameters;
+            let first = ModelArray::Sh.parameters(model.sh_degree).start;
+            values.extend_from_slice(&model.sh_of(row)[start - first..end - first]);
+        }
+    }
+    values
 }

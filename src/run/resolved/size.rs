@@ -25,8 +25,8 @@ const TILE: u32 = 16;
 const DEFAULT_IMAGE_CACHE: u64 = 1 << 30;
 /// (Row, tile) pairs per row of the budget without `--memory`.
 const PAIRS_PER_ROW: usize = 16;
-/// On a GPU, lists with more than [`PAIRS`]`[0]` pairs per row have at most this many pairs per tile of the largest image,
-/// or [`PAIRS_OF_SMALL_IMAGE`]. Few views exceed that, and those are rendered in bands.
+/// On a GPU without `--memory`, lists with more than [`PAIRS`]`[0]` pairs per row have at most this many pairs per tile of
+/// the largest image, or [`PAIRS_OF_SMALL_IMAGE`]. Few views exceed that, and those are rendered in bands.
 const PAIRS_PER_TILE: usize = 512;
 const PAIRS_OF_SMALL_IMAGE: usize = 1 << 20;
 /// Minimum number of trained rows of a useful model, unless the user asks for fewer.

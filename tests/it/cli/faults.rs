@@ -26,7 +26,7 @@ fn flags_out_of_range_are_refused() {
         ("--policy-set diet.rho=much", &["rho", "much"]),
         ("--policy-set rho", &["--policy-set", "rho"]),
         ("--policy-set vanilla.tau=1", &["vanilla", "--policy"]),
-        ("--budget 0", &["--budget", "between 1"]),
+        ("--budget 0", &["--budget", "at least 1"]),
         ("--budget many", &["--budget", "many", "200k"]),
         ("--budget 0.5", &["--budget", "0.5"]),
         ("--budget 5000M", &["--budget", "4 billion"]),

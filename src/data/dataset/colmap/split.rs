@@ -88,7 +88,7 @@ pub(super) fn apply(
 }
 
 impl List {
-    /// Reads the list at `path`, if there is one. Names without a photograph are noted: COLMAP does not find the poses
+    /// Reads the list at `path`, if there is one with names. Names without a photograph are noted: COLMAP does not find the poses
     /// of all photographs.
     fn read(
         root: &Root,
@@ -102,6 +102,9 @@ impl List {
         let shown = path.strip_prefix(root.path()).unwrap_or(path).to_string_lossy().into_owned();
         root.existing(DataPath { file: path, field: "the list", value: &shown })?;
         let text = files::read_text(path, MAX_BYTES).map_err(LoadError::io(path))?;
+        if text.trim().is_empty() {
+            return Ok(None);
+        }
         let lines = text.lines().map(str::trim).filter(|line| !line.is_empty());
         let (mut frames, mut unknown) = (HashSet::new(), Vec::new());
         for line in lines {

@@ -117,7 +117,7 @@ fn jpeg(mut input: impl BufRead + Seek) -> Option<Stated> {
     const SCAN: u8 = 0xda;
     const END: u8 = 0xd9;
     let mut parts: Vec<(u8, Vec<u8>)> = Vec::new();
-    let (mut count, mut is_adobe_rgb) = (0, false);
+    let (mut count, mut bytes_of_parts, mut is_adobe_rgb) = (0, 0, false);
     loop {
         let [mut marker] = bytes::<1>(&mut input)?;
         if marker != 0xff {
@@ -143,6 +143,10 @@ fn jpeg(mut input: impl BufRead + Seek) -> Option<Stated> {
         } else if let Some([number, of, part @ ..]) = segment.strip_prefix(PART) {
             parts.push((*number, part.to_vec()));
             count = usize::from(*of);
+            bytes_of_parts += part.len() as u64;
+            if bytes_of_parts > MAX_PROFILE {
+                return Some(Stated::DamagedProfile);
+            }
         }
     }
     if parts.is_empty() {

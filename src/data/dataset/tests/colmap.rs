@@ -180,7 +180,9 @@ fn assert_split(made: &Made, train: &[&str], test: &[&str]) {
 #[test]
 fn lists_of_other_trainers_define_the_split() {
     let made = Made::colmap_txt();
-    // Without lists, every eighth photograph is held out.
+    // Without lists, every eighth photograph is held out; a list without names is none.
+    assert_split(&made, &["b.png", "c.png"], &["a.png"]);
+    made.write("test_list.txt", "\n");
     assert_split(&made, &["b.png", "c.png"], &["a.png"]);
     made.write("test_list.txt", "c.png\n");
     assert_split(&made, &["a.png", "b.png"], &["c.png"]);

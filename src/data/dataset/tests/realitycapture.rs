@@ -88,8 +88,9 @@ fn coordinates_in_degrees_are_refused() {
     let (lon, lat) = (-34.828_786_5, -7.163_311_9);
     let made = moved([[lon, lat, 85.0], [lon + 1e-4, lat, 84.5], [lon, lat + 2e-4, 85.25]]);
     refused("degrees", &made, &LoadOptions::default(), "cameras.csv, x, y, degrees, local:1");
-    // A few centimetres around a small object, and a flight at almost constant height in metres.
+    // A few centimetres around a small object, a flight at almost constant height, and a lift, in metres.
     for centres in [
+        [[0.1, 0.2, 0.0], [0.1, 0.21, 1.5], [0.1, 0.2, 3.0]],
         [[2.0, 1.0, 0.0], [2.05, 1.0, 0.02], [2.0, 1.05, 0.5]],
         [[0.0, 0.0, 85.0], [50.0, 0.0, 84.5], [0.0, 50.0, 85.25]],
     ] {

@@ -137,6 +137,12 @@ fn test_frames_are_held_out_and_bad_frames_left_out() {
     }));
     assert_eq!((names(&data.train).len(), data.test.len()), (2, 0));
     assert_noted(&data, "1 of 3 frames are marked is_bad, first: ./images/c.png");
+    let made = Made::transforms(|json| {
+        for frame in json["frames"].as_array_mut().unwrap() {
+            frame["is_bad"] = true.into();
+        }
+    });
+    refused("all", &made, &LoadOptions::default(), "transforms.json, is_bad, marks all frames");
 }
 
 #[test]

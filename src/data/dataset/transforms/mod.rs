@@ -156,6 +156,9 @@ fn read(
         frames.extend((trained && tested).then(|| Frame { held_out: false, ..frame.clone() }));
         frames.extend((trained || tested).then_some(frame));
     }
+    if frames.is_empty() && bad.len() == listed.len() && !bad.is_empty() {
+        return Err(top.fault("is_bad", "it marks all frames"));
+    }
     if let Some((field, problem)) = lists.fault() {
         return Err(top.fault(field, problem));
     }
