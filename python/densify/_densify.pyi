@@ -41,6 +41,7 @@ __all__ = [
     "top_k",
     "compare",
     "compress",
+    "parse_rows",
     "parse_target",
     "plan",
     "report",
