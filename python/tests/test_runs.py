@@ -195,33 +195,6 @@ def test_a_trainer_that_has_failed_does_not_continue(scene: Path) -> None:
     assert len(trainer.model()) == trainer.rows == 200 and trainer.render(cameras(1)[0]).colour.shape == (24, 32, 3)
 
 
-def test_threads_that_step_the_same_trainer_do_not_end_it(scene: Path) -> None:
-    trainer = densify.prepare(scene, **{**SMALL, "iterations": 600})
-    errors: set[str] = set()
-
-    def work() -> None:
-        while trainer_steps() < 600:
-            try:
-                trainer.step()
-            except RuntimeError as error:
-                errors.add(str(error))
-                if "in use" not in str(error):
-                    return
-
-    def trainer_steps() -> int:
-        try:
-            return trainer.steps_done
-        except RuntimeError:
-            return 0
-
-    threads = [threading.Thread(target=work) for _ in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert not any("a step has failed" in error for error in errors) and trainer.steps_done >= 600
-
-
 @not_on_windows
 def test_ctrl_c_while_a_trainer_is_stepped(scene: Path) -> None:
     from .made import make
