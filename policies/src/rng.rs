@@ -18,6 +18,8 @@ pub enum Purpose {
     Draw = 4,
     /// Stochastic rounding of numbers stored in fewer bits.
     Round = 5,
+    /// Numbers that a policy in another language draws for its own ends; the counter is that of the call.
+    Own = 6,
 }
 
 /// The random draws at one event of a policy.
@@ -42,7 +44,12 @@ impl PolicyRng {
 
     /// A number in (0, 1): (k + ½) / 2²³ with a random k of 23 bits.
     pub fn uniform(&self, row: u32, purpose: Purpose) -> f32 {
-        unit_open(self.bits(row, purpose, 0)[0])
+        self.uniform_at(row, purpose, 0)
+    }
+
+    /// As [`uniform`](Self::uniform), with another number for each counter.
+    pub fn uniform_at(&self, row: u32, purpose: Purpose, counter: u32) -> f32 {
+        unit_open(self.bits(row, purpose, counter)[0])
     }
 
     /// A number in (0, 1) with 52 bits: among millions of rows, numbers of 23 bits often repeat.
@@ -92,8 +99,14 @@ fn pcg4d(v: [u32; 4]) -> [u32; 4] {
 mod tests {
     use super::*;
 
-    const PURPOSES: [Purpose; 5] =
-        [Purpose::Select, Purpose::Place, Purpose::Noise, Purpose::Draw, Purpose::Round];
+    const PURPOSES: [Purpose; 6] = [
+        Purpose::Select,
+        Purpose::Place,
+        Purpose::Noise,
+        Purpose::Draw,
+        Purpose::Round,
+        Purpose::Own,
+    ];
     const DRAWS: u32 = 1 << 16;
 
     /// χ² of counts that should all be equal, in standard deviations from its mean.

@@ -21,7 +21,7 @@ class Rule:
 
 
 def by(factor: ArrayLike) -> Rule:
-    """Multiplies scales (one factor, or three for the axes) or opacities (in (0, 1])."""
+    """Multiplies scales (or each axis, with the shape [1, 3] or [rows, 3]) or opacities (in (0, 1])."""
     return Rule("by", factor)
 
 

@@ -28,10 +28,10 @@ class Options(TypedDict, total=False):
     """Use only the views that this file names, one per line. A tab and four numbers from 0 to 1 after a name (left, top, right, bottom) select a part of the view. Views are split into training and test views before the others are left out"""
 
     far_cameras: str
-    """Treatment of views whose camera is more than 10 times as far from the others as usual, if at most one view in 20 has such a camera: structure from motion misplaces some (default: leave-out)"""
+    """Treatment of views whose camera is more than 10 times farther out than the median camera, if at most one camera in 20 is that far: structure from motion misplaces some cameras (default: leave-out)"""
 
     keep_fov: bool
-    """Keep the full field of view of a distorted lens, and mask pixels that the lens did not see; by default photographs are cropped to the largest rectangle without such pixels. Where the distortion folds over, the invertible part is kept (default: false)"""
+    """Keep the full field of view of a distorted lens, and mask pixels that the lens did not see; by default photographs are cropped to the largest rectangle without such pixels. Where the distortion folds over, the part that can be undistorted is kept (default: false)"""
 
     invert_masks: bool
     """Masks are white where photographs are to be ignored; by default black is ignored (default: false)"""
@@ -43,22 +43,22 @@ class Options(TypedDict, total=False):
     """Render a built-in scene again, and do not keep it in the user's cache folder (default: false)"""
 
     resolution: int
-    """1, 2, 4 or 8: photographs this many times smaller (uses images_2, images_4, images_8 if they exist); any larger number: their width in pixels"""
+    """Size of the photographs: 1, 2, 4 or 8 divides it (images_2, images_4, images_8 are read if they exist); any larger number is the width in pixels"""
 
     background: str
     """Background of the scene, and of transparent images: black, white, random (another colour at every step) or #rrggbb (default: black)"""
 
     init: StrPath
-    """Source of the first Gaussians: one on each of the dataset's points, random places, or a model in the dataset's coordinates: a file by any program, or a run's folder (default: points if the dataset has any, else random)"""
+    """Source of the first Gaussians: the dataset's points, random points, or a model (a file by any program, or a run's folder) in the dataset's coordinates (default: points if the dataset has any, else random)"""
 
     init_rates: str
-    """Learning rates of a run from a model; --lr changes single rates (default: fine)"""
+    """Learning rates of a run that starts from a model; --lr changes single rates (default: fine)"""
 
     freeze: StrPath
     """A model in the dataset's coordinates (a file by any program, or a run's folder) whose Gaussians are rendered but never change: they are neither trained, moved nor removed. The Gaussians of --init are trained beside them; the budget counts frozen and trained Gaussians"""
 
     antialias: str
-    """Lower the opacity of Gaussians smaller than a pixel, to make up for the kernel (0.3 or 0.1 px²) that widens them, so that the model also suits other resolutions; none: no antialiasing (default: as the model of --init or --freeze, else none; without KERNEL: 0.3)"""
+    """Lower the opacity of Gaussians smaller than a pixel, to make up for the kernel (0.3 or 0.1 px²) that widens them, so that the model also suits other resolutions; none: no antialiasing (default: that of the model of --init or --freeze, else none; without KERNEL: 0.3)"""
 
     init_points: int | str
     """Number of random points to start from (default: half the budget, at most 100k)"""
@@ -73,10 +73,10 @@ class Options(TypedDict, total=False):
     """Limit of all memory of the run: 512MiB, 1.5GiB, 800MB. On a GPU it limits the device's memory, else that of the process"""
 
     tile_cap: int | str
-    """Maximum number of (Gaussian, tile) pairs in memory; views with more are processed in bands, which is exact but slower (default: 16 per Gaussian of the budget, or chosen for --memory)"""
+    """Maximum number of (Gaussian, tile) pairs in memory; views with more are processed in bands, which is exact but slower (default: 16 per Gaussian of the budget, on a GPU fewer for large models, or chosen for --memory)"""
 
     image_cache: int | str
-    """Memory for decoded photographs, and the same amount on a GPU; others are decoded and uploaded again when they are needed. auto: an eighth of the memory of the run, plus what is left of --memory; 1GiB if --memory limits a GPU (default: 1GiB, or as auto with --memory)"""
+    """Memory for decoded photographs, and the same amount on a GPU; the other photographs are decoded and uploaded again when they are needed. auto: an eighth of the memory of the run, plus what is left of --memory; 1GiB if --memory limits a GPU (default: 1GiB, or auto with --memory)"""
 
     sh_degree: int | str
     """Dependence of colours on the viewing direction: 0 none, 3 most; auto: as much as the scene requires (default: 3, or lower if --memory requires it)"""
@@ -97,19 +97,19 @@ class Options(TypedDict, total=False):
     """Seed of all random numbers (default: 0)"""
 
     lr: Mapping[str, float]
-    """Set a learning rate: mean_start, mean_end, log_scale, quat, opacity, sh_dc, sh_rest; for all but the means also NAME_end; fade: final factor of opacity, sh_dc and sh_rest, which starts to act after the share fade_from of the run; boost: initial factor of all (1 for runs of 30,000). A rate of 0 freezes its values. May be repeated"""
+    """Set a learning rate: mean_start, mean_end, log_scale, quat, opacity, sh_dc, sh_rest; for all but the means also NAME_end; fade: final factor of opacity, sh_dc and sh_rest, which sets in after the share fade_from of the run; boost: initial factor of all rates (1 in runs of 30,000 iterations). A rate of 0 freezes its values. May be repeated"""
 
     preset: str
     """Set several options and knobs at once: exact, balanced, fast or tiny-memory. Options that are given override the preset (default: balanced)"""
 
     knob: Mapping[str, Any]
-    """Set a knob of the trade-off between speed, memory and accuracy, such as alpha_min=1/128; `densify knobs` lists them. May be repeated"""
+    """Set a knob, which trades accuracy for speed or memory, such as alpha_min=1/128; `densify knobs` lists them. May be repeated"""
 
     exposure: str
     """Learn an exposure for each training photograph: a factor and an offset per colour channel. Test views are then measured both as rendered and with the exposure that fits best. auto needs the tracks of a reconstruction (default: off)"""
 
     exposure_model: str
-    """Form of an exposure (default: channels)"""
+    """Form of the learned exposures (default: channels)"""
 
     on_nan: str
     """Treatment of Gaussians with a non-finite value; the model is checked at least every 100 iterations (default: prune)"""
@@ -118,10 +118,10 @@ class Options(TypedDict, total=False):
     """Make runs reproducible byte for byte. On the processor they always are; a GPU then adds up gradients in a fixed order, which is slower than its atomics (`densify devices`) (default: false)"""
 
     backend: str
-    """Where to compute (default: auto)"""
+    """Backend to compute on (default: auto)"""
 
     gpu: str
-    """The adapter to compute on, by part of its name; `densify devices` lists them (default: the best)"""
+    """GPU adapter to compute on, by part of its name; `densify devices` lists them (default: the best)"""
 
     threads: int
     """Processor threads to use, 1 to 256; the result does not depend on it (default: all)"""

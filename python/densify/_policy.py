@@ -41,6 +41,7 @@ _STATE = "densify_state"
 T = TypeVar("T")
 _importing = 0
 _installed = False
+_installing = False
 
 
 @dataclass(frozen=True)
@@ -59,6 +60,10 @@ class PolicyInfo:
 class _Registered:
     name: str
     file: str | None
+
+
+#: Policies by name that other processes do not find by themselves, unlike those of installed packages.
+_of_this_program: dict[str, _Registered] = {}
 
 
 def interval(default: int) -> int:
@@ -94,7 +99,7 @@ def policy(name: str, *, summary: str, source: str) -> Callable[[type[T]], type[
         for method in ("needs", "is_due", "plan"):
             if not callable(getattr(cls, method, None)):
                 raise TypeError(f"policy `{name}`: the class has no method `{method}`")
-        made = cls if dataclasses.is_dataclass(cls) else dataclass(cls)
+        made = cls if "__dataclass_fields__" in vars(cls) else dataclass(cls)
         _describe(made, name, summary, source, inspect.cleandoc(manual))
         return made
 
@@ -132,7 +137,12 @@ def _describe(cls: type[Any], name: str, summary: str, source: str, manual: str)
     shown = file or f"<{cls.__module__}>"
     about = (name, summary, source, manual)
     _densify.register(cls, about, (shown, line), (identity, _provenance(file)), parameters)
-    setattr(cls, MARK, _Registered(name, file))
+    registered = _Registered(name, file)
+    setattr(cls, MARK, registered)
+    if _installing:
+        _of_this_program.pop(name, None)
+    else:
+        _of_this_program[name] = registered
 
 
 def _provenance(file: str | None) -> str:
@@ -240,13 +250,20 @@ def numbers_of(answer: Any, class_name: str) -> list[float]:
 
 
 def state_of(policy: Any) -> str | None:
-    """The state of a policy as JSON; None for a class without state."""
+    """The state of a policy as JSON; None for a class without state.
+
+    The attributes become what the JSON says, as after a resume: dicts in the order of their keys, lists that nothing
+    else shares.
+    """
     if not policy._states:
         return None
     values = {name: getattr(policy, name) for name in sorted(policy._states)}
     for name, value in values.items():
         _check_state(name, value)
-    return json.dumps(values, allow_nan=False)
+    text = json.dumps(values, allow_nan=False, sort_keys=True)
+    for name, value in json.loads(text).items():
+        setattr(policy, name, value)
+    return text
 
 
 def _check_state(name: str, value: Any) -> None:
@@ -277,10 +294,6 @@ def restore_state(policy: Any, text: str) -> None:
     values = json.loads(text)
     if not isinstance(values, dict) or set(values) != set(policy._states):
         raise ValueError(f"expected the values {', '.join(sorted(policy._states))}, found {text[:200]}")
-    for name, value in values.items():
-        known = getattr(policy, name)
-        if known is not None and value is not None and type(value) is not type(known):
-            raise ValueError(f"`{name}` is {type(value).__name__}, not {type(known).__name__}")
     for name, value in values.items():
         setattr(policy, name, value)
 
@@ -325,27 +338,48 @@ def check_not_importing() -> None:
 
 def load_installed() -> None:
     """Imports the policies of installed packages, once."""
-    global _installed
+    global _installed, _installing
     if _installed:
         return
-    _installed = True
-    for point in entry_points(group=ENTRY_POINTS):
-        try:
-            point.load()
-        except Exception as error:
-            warnings.warn(f"the policies of {point.value} cannot be imported: {error}", stacklevel=2)
+    _installed = _installing = True
+    try:
+        for point in entry_points(group=ENTRY_POINTS):
+            try:
+                point.load()
+            except Exception as error:
+                warnings.warn(f"the policies of {point.value} cannot be imported: {error}", stacklevel=2)
+    finally:
+        _installing = False
 
 
 def name_and_settings(policy: Any) -> tuple[str, dict[str, Any], str | None]:
     """The name of a policy, the parameters that were given to an instance, and the file of its class."""
     if isinstance(policy, str):
         load_installed()
-        return policy, {}, None
-    mark = getattr(policy, MARK, None)
+        known = _of_this_program.get(policy)
+        return policy, {}, None if known is None else known.file
+    # A subclass is a policy of its own only if it is decorated itself.
+    mark = vars(policy if isinstance(policy, type) else type(policy)).get(MARK)
     if not isinstance(mark, _Registered):
         raise TypeError(f"policy: expected a name, or a class or an instance made with @densify.policy, not {policy!r}")
     given = () if isinstance(policy, type) else policy._given
     return mark.name, {name: getattr(policy, name) for name in given}, mark.file
+
+
+def not_in_a_file(name: str) -> InputError:
+    """The error for a policy that only this process has."""
+    return InputError(
+        f"policy `{name}` is not in a file, so other processes cannot import it;"
+        " write it to one (%%writefile in a notebook)"
+    )
+
+
+def file_of_name(name: str) -> str | None:
+    """The file to import for a policy of this name in another process; None for built-in and installed ones."""
+    known = _of_this_program.get(name)
+    if known is not None and known.file is None:
+        raise not_in_a_file(name)
+    return None if known is None else known.file
 
 
 def policies() -> list[PolicyInfo]:

@@ -7,7 +7,6 @@ import html
 import json
 import tempfile
 from collections.abc import Iterator
-from functools import cached_property
 from os import fspath
 from pathlib import Path
 from typing import Any
@@ -39,7 +38,7 @@ class Run:
     def __repr__(self) -> str:
         return f"<densify.Run {fspath(self.folder)!r}>"
 
-    @cached_property
+    @property
     def config(self) -> dict[str, Any]:
         """The options with every choice made."""
         config: dict[str, Any] = json.loads(_densify.run_config(fspath(self.folder)))
@@ -88,21 +87,20 @@ class Run:
         """Writes the model in another format; see ``densify.export``."""
         return export(self, path, **more)
 
-    def report(self, path: StrPath | None = None, *, overwrite: bool = True) -> Path:
-        """Writes the report on this run as one HTML file, by default report.html in its folder."""
+    def report(self, path: StrPath | None = None, *, overwrite: bool = False) -> Path:
+        """Writes the report on this run as one HTML file, by default report.html in its folder, which is replaced."""
         file = self.folder / "report.html" if path is None else Path(path)
         _densify.report(
             [fspath(self.folder)],
             fspath(file),
             "{}",
             iteration=None,
-            overwrite=overwrite,
+            overwrite=overwrite or path is None,
             listener=Listener(False),
         )
         return file
 
-    @cached_property
-    def _html(self) -> str:
+    def _repr_html_(self) -> str:
         parts = [f"<b>{html.escape(self.folder.name)}</b>"]
         rows = [(name, f"{value:.4g}") for name, value in self.scores.items()]
         try:
@@ -122,9 +120,6 @@ class Run:
         except Exception as error:  # A picture is not worth the cell: the dataset may have moved.
             parts.append(f"<p>no pictures: {html.escape(str(error))}</p>")
         return "".join(parts)
-
-    def _repr_html_(self) -> str:
-        return self._html
 
 
 def read_records(path: Path) -> list[dict[str, Any]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import tempfile
 import weakref
@@ -247,7 +248,7 @@ def write_dataset(
     [n, 3] are where Gaussians start, ``colours`` [n, 3] are uint8 or in [0, 1]. ``test`` are the views to hold out.
     """
     folder = Path(folder)
-    if len(images) != len(cameras) or not images:
+    if len(images) != len(cameras) or len(images) == 0:
         raise ValueError(f"images and cameras: expected as many of each, found {len(images)} and {len(cameras)}")
     if folder.exists() and any(folder.iterdir()):
         raise InputError(f"{folder} is not empty; name another folder")
@@ -291,7 +292,10 @@ def write_dataset(
     if cloud is not None:
         (folder / "points3d.ply").write_bytes(cloud)
         scene["ply_file_path"] = "points3d.ply"
-    (folder / "transforms.json").write_text(json.dumps(scene, allow_nan=False), encoding="utf-8")
+    # The file appears last and whole: without it, the folder is no dataset.
+    partial = folder / ".transforms.json.partial"
+    partial.write_text(json.dumps(scene, allow_nan=False), encoding="utf-8")
+    os.replace(partial, folder / "transforms.json")
     return folder
 
 

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, cast
 
 from . import _densify, _policy
-from ._errors import InputError
 from ._progress import Listener
 from ._run import read_records
 from ._scenes import StrPath, plain
@@ -112,7 +111,7 @@ def compare(
     scenes: Scene | Sequence[Scene],
     policies: Sequence[PolicyLike],
     *,
-    budget: int | Sequence[int] | Mapping[str, int],
+    budget: int | str | Sequence[int | str] | Mapping[str, int | str],
     seeds: int = 3,
     iterations: int = 7000,
     output: StrPath = "comparison",
@@ -130,14 +129,12 @@ def compare(
     names = []
     for policy in policies:
         name, settings, file = _policy.name_and_settings(policy)
-        if not isinstance(policy, str):
-            if file is None:
-                raise InputError(
-                    f"policy `{name}` is not in a file, so other processes cannot import it;"
-                    " write it to one (%%writefile in a notebook)"
-                )
-            if file not in files:
-                files.append(file)
+        if isinstance(policy, str):
+            file = _policy.file_of_name(name.partition(":")[0])
+        elif file is None:
+            raise _policy.not_in_a_file(name)
+        if file is not None and file not in files:
+            files.append(file)
         words = [f"{key}={str(value).lower() if isinstance(value, bool) else value}" for key, value in settings.items()]
         names.append(":".join([name, *words]))
     if files:
@@ -146,9 +143,9 @@ def compare(
     all_scenes = cast("Sequence[Scene]", [scenes] if single else scenes)
     budgets: list[tuple[str | None, int]]
     if isinstance(budget, Mapping):
-        budgets = list(budget.items())
+        budgets = [(scene, _rows_of(rows)) for scene, rows in budget.items()]
     else:
-        budgets = [(None, rows) for rows in ([budget] if isinstance(budget, int) else budget)]
+        budgets = [(None, _rows_of(rows)) for rows in ([budget] if isinstance(budget, (int, str)) else budget)]
     stop = _densify.Stop()
     with noting(stop):
         summary, report = _densify.compare(
@@ -164,6 +161,10 @@ def compare(
         )
     path = Path(report)
     return Comparison(summary, path, path.with_suffix(".html"), read_records(path.with_suffix(".jsonl")))
+
+
+def _rows_of(budget: int | str) -> int:
+    return _densify.parse_rows(budget) if isinstance(budget, str) else budget
 
 
 class Page:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from . import _densify, _policy
 from ._errors import Interrupted
@@ -131,16 +131,22 @@ class Trainer:
         return trainer
 
     def step(self) -> Step:
-        """Does one iteration."""
-        step, view, name, loss, l1, ssim, rows, events = self._core.step()
+        """Does one iteration. Ctrl-C raises Interrupted after it."""
+        with noting(self._stop):
+            step, view, name, loss, l1, ssim, rows, events = self._core.step()
+        if self._stop.by_signal:
+            self._interrupt()
         return Step(step, view, name, loss, l1, ssim, rows, json.loads(events))
 
     def __iter__(self) -> Iterator[Step]:
-        with noting(self._stop):
-            while self.steps_done < self.iterations:
-                if self._stop.asked:
-                    raise Interrupted(f"stopped after step {self.steps_done}")
-                yield self.step()
+        while self.steps_done < self.iterations:
+            if self._stop.asked:
+                self._interrupt()
+            yield self.step()
+
+    def _interrupt(self) -> NoReturn:
+        self._stop.clear()
+        raise Interrupted(f"stopped after step {self.steps_done}")
 
     def stop(self) -> None:
         """Ends the loop over this trainer before its next step; other threads may call it."""
@@ -149,8 +155,12 @@ class Trainer:
     def finish(self, *, overwrite: bool = False, progress: bool = True) -> Run:
         """Trains to the end and writes all files of the run, as ``train`` does."""
         listener = Listener(progress)
-        with noting(self._stop):
-            folder = self._core.finish(overwrite=overwrite, listener=listener, stop=self._stop)
+        try:
+            with noting(self._stop):
+                folder = self._core.finish(overwrite=overwrite, listener=listener, stop=self._stop)
+        except Interrupted:
+            self._stop.clear()
+            raise
         return Run(folder, dataset=self._dataset)
 
     def model(self) -> Model:
@@ -158,7 +168,10 @@ class Trainer:
         return Model._of(self._core.model())
 
     def render(self, camera: Camera, *, background: str | Sequence[float] = "black") -> Rendering:
-        """Renders a camera in the dataset's own coordinates."""
+        """Renders a camera in the dataset's own coordinates, no larger than the training views.
+
+        Larger ones take more memory than the run promises: ``trainer.model().render(camera)`` renders them.
+        """
         return Rendering(*self._core.render(camera._parts(), colour_of(background)))
 
     @property

@@ -102,7 +102,7 @@ impl<const WIDTH: usize> PerRow<WIDTH> {
         let (values, shape) = floats(given, name)?;
         let (chunks, _) = values.as_chunks::<WIDTH>();
         let own: &[usize] = if WIDTH == 1 { &[] } else { &[WIDTH] };
-        if shape == own {
+        if shape == own || (WIDTH > 1 && shape == [1, WIDTH]) {
             return Ok(Self::Same(chunks[0]));
         }
         if shape.len() == own.len() + 1 && shape[0] == count && shape[1..] == *own {

@@ -42,6 +42,18 @@ impl Stop {
         self.asked.store(true, Ordering::SeqCst);
     }
 
+    /// Takes the request back.
+    fn clear(&self) {
+        self.by_signal.store(false, Ordering::SeqCst);
+        self.asked.store(false, Ordering::SeqCst);
+    }
+
+    /// True if a signal asks for the stop.
+    #[getter]
+    fn by_signal(&self) -> bool {
+        self.by_signal.load(Ordering::SeqCst)
+    }
+
     /// True once the stop was asked for.
     #[getter]
     fn asked(&self) -> bool {

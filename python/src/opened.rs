@@ -46,7 +46,7 @@ pub(crate) fn open_model(
 ) -> PyResult<OpenedModel> {
     let antialias = antialias.map(|name| model::antialiasing(Some(name))).transpose()?;
     Listener::new(Some(listener), None)?.follow(py, move |follower| {
-        let mut given = options::spec(options)?;
+        let mut given = options::for_model(options, !is_model(&path), &[])?;
         let machine = Machine::open(&given.device, follower)?;
         if !is_model(&path) {
             let config = RunConfig::read(&path)?;
@@ -169,16 +169,27 @@ impl OpenedModel {
                 Comparison { lpips: lpips.as_ref(), fits_exposure: fit_exposure || has_exposures };
             let mut check = CoordinateCheck::new(views.count());
             let (backend, degree) = (opened.backend.as_mut(), opened.sh_degree);
+            let stopped = || {
+                let stop = follower.interrupt();
+                stop.map(|stop| Failure::new(stop.exit_code, format!("stopped by {}", stop.name)))
+            };
             let scores = evaluate(backend, &views, background, degree, comparison, |evaluated| {
                 check.add(evaluated.view, evaluated.rendering, evaluated.image, background);
                 follower.interrupt().map_or(ControlFlow::Continue(()), |_| ControlFlow::Break(()))
-            })?;
+            });
+            let scores = match (scores, stopped()) {
+                (Ok(scores), None) => scores,
+                (_, Some(failure)) => return Err(failure),
+                (Err(error), None) => return Err(error.into()),
+            };
             check.note(None, &self.path, follower);
             let written = self.run.as_ref().filter(|_| self.writes);
             if let Some((_, iteration)) = written {
                 write_scores(&self.path, split, *iteration, &scores)?;
             }
-            let geometry = opened.geometry(&views, &|| follower.interrupt().is_some())?;
+            let geometry = opened
+                .geometry(&views, &|| follower.interrupt().is_some())
+                .map_err(|failure| stopped().unwrap_or(failure))?;
             if let (Some((_, iteration)), Some(measured)) = (written, &geometry) {
                 write_geometry(&self.path, split, *iteration, measured)?;
             }

@@ -1,7 +1,7 @@
 //! Options of a run from Python: keyword arguments, which arrive as JSON and are checked as a TOML table.
 
 use densify_run::failure::Failure;
-use densify_run::{Partial, RunSpec};
+use densify_run::{DataSpec, DeviceSpec, Partial, RunSpec};
 use toml::{Table, Value};
 
 /// The origin of options in messages.
@@ -46,6 +46,26 @@ pub(crate) fn table(json: &str) -> Result<Table, Failure> {
 /// The options of a JSON object, checked one by one.
 pub(crate) fn partial(json: &str) -> Result<Partial, Failure> {
     Partial::new(table(json)?, ORIGIN)
+}
+
+/// The options for a model: those of the device, the scene, those in `more`, and of a file those that read the dataset.
+/// A run has the others in its folder.
+///
+/// # Errors
+/// Names the first option that has no effect.
+pub(crate) fn for_model(json: &str, is_run: bool, more: &[&str]) -> Result<RunSpec, Failure> {
+    let given = partial(json)?;
+    let has_effect = |name: &str| {
+        let of_file = || name == "near" || DataSpec::NAMES.contains(&name);
+        ["scene"].iter().chain(more).any(|known| *known == name)
+            || DeviceSpec::NAMES.contains(&name)
+            || (!is_run && of_file())
+    };
+    if let Some((name, _)) = given.iter().find(|(name, _)| !has_effect(name)) {
+        let remedy = if is_run { "; a run has its own in its config.toml" } else { "" };
+        return Err(Failure::input(format!("`{name}` has no effect here{remedy}: leave it out")));
+    }
+    given.describe()
 }
 
 /// The run that a JSON object describes, over its preset and the defaults.

@@ -38,7 +38,7 @@ pub(crate) fn serve(
     listener: &Bound<'_, PyAny>,
 ) -> PyResult<PageCore> {
     Listener::new(Some(listener), None)?.follow(py, move |follower| {
-        let spec = options::spec(options)?;
+        let spec = options::for_model(options, densify_view::is_run(&path), &["antialias"])?;
         let host = Ipv4Addr::LOCALHOST.into();
         let server = Server::open(ListenAddress { host, port, needs_token: false })?;
         let machine = Machine::open(&spec.device, follower)?;

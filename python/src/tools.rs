@@ -83,7 +83,7 @@ pub(crate) fn compress(
 ) -> PyResult<(PathBuf, Vec<(&'static str, usize, u8, &'static str, u64, f64, Option<f64>)>)> {
     let antialias = antialias.map(|name| model::antialiasing(Some(name))).transpose()?;
     Listener::new(Some(listener), Some(stop))?.follow(py, move |follower| {
-        let given = options::spec(options)?;
+        let given = options::for_model(options, !is_model(&model), &[])?;
         let formats = match format {
             Some("any") => compress_formats(),
             Some(name) => {
@@ -296,4 +296,10 @@ pub(crate) fn parse_target(text: &str) -> PyResult<(Option<usize>, Option<u64>)>
         return Ok((None, Some(numbers::bytes(text).map_err(wrong)?)));
     }
     Ok((Some(numbers::rows(text).map_err(wrong)?), None))
+}
+
+/// A number of rows, such as "5k".
+#[pyfunction]
+pub(crate) fn parse_rows(text: &str) -> PyResult<usize> {
+    numbers::rows(text).map_err(|error| PyValueError::new_err(format!("budget: {error}")))
 }

@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 use std::sync::{Mutex, MutexGuard, TryLockError};
 
+use densify_core::camera::Camera;
 use densify_core::memory::Ledger;
 use densify_data::views::ViewSource;
 use densify_run::failure::Failure;
@@ -74,15 +75,29 @@ pub(crate) fn prepare(
         restart_peak();
         let run = Run::prepare_on(&spec, None, Host::new(follower))?;
         let (last, ledger) = (spec.schedule.iterations.0, run.ledger.clone());
-        Ok(TrainerCore { state: Mutex::new(State::Ready(Box::new(run))), spec, last, ledger })
+        let state = State { run: Some(Box::new(run)), over: None };
+        Ok(TrainerCore { state: Mutex::new(state), spec, last, ledger })
     })
 }
 
 /// A prepared run.
-enum State {
-    Ready(Box<Run>),
-    /// A step has failed, or the run was trained to the end.
-    Over(&'static str),
+struct State {
+    /// `None` once the run was trained to the end.
+    run: Option<Box<Run>>,
+    /// The reason why there are no more steps, if a step has failed or the run was trained to the end.
+    over: Option<&'static str>,
+}
+
+impl State {
+    fn run(&mut self) -> PyResult<&mut Run> {
+        self.run.as_deref_mut().ok_or_else(|| over(FINISHED))
+    }
+}
+
+const FINISHED: &str = "it has been trained to the end";
+
+fn over(why: &str) -> PyErr {
+    PyRuntimeError::new_err(format!("this trainer cannot continue: {why}"))
 }
 
 /// A run that is stepped from Python.
@@ -109,15 +124,29 @@ impl TrainerCore {
         py: Python<'_>,
         work: impl FnOnce(&mut Run) -> Result<T, Failure> + Send,
     ) -> PyResult<T> {
-        let mut guard = self.lock()?;
-        let state = &mut *guard;
-        match state {
-            State::Ready(run) => detached(py, move || work(run)),
-            State::Over(why) => {
-                Err(PyRuntimeError::new_err(format!("this trainer cannot continue: {why}")))
-            }
-        }
+        let mut state = self.lock()?;
+        let run = state.run()?;
+        detached(py, move || work(run))
     }
+}
+
+/// Fails for a camera with more pixels than the training views have: the backend would take more memory than promised.
+fn check_size(run: &Run, camera: &Camera) -> Result<(), Failure> {
+    let views = run.trainer.views();
+    let sizes =
+        (0..views.count()).map(|view| views.camera(view)).map(|view| (view.width, view.height));
+    let fits = |(width, height): (u32, u32)| camera.width <= width && camera.height <= height;
+    if sizes.clone().any(fits) {
+        return Ok(());
+    }
+    let (width, height) = sizes
+        .max_by_key(|&(width, height)| u64::from(width) * u64::from(height))
+        .unwrap_or_default();
+    Err(Failure::input(format!(
+        "a camera of {}x{} pixels is larger than the training views ({width}x{height}), and would take more memory than \
+         the run promises; render it with trainer.model().render(camera)",
+        camera.width, camera.height
+    )))
 }
 
 #[pymethods]
@@ -125,7 +154,12 @@ impl TrainerCore {
     /// One iteration: step, index of the view, name of the view, loss, L1, SSIM, rows, and the edits as JSON.
     #[expect(clippy::type_complexity, reason = "the Python side makes an object of it")]
     fn step(&self, py: Python<'_>) -> PyResult<(u32, usize, String, f32, f32, f32, usize, String)> {
-        let done = self.with(py, |run| {
+        let mut state = self.lock()?;
+        if let Some(why) = state.over {
+            return Err(over(why));
+        }
+        let run = state.run()?;
+        let done = detached(py, move || {
             let report = run.trainer.step()?;
             let name = run.trainer.views().name(report.view).to_owned();
             // Edits are plain numbers and text.
@@ -142,11 +176,9 @@ impl TrainerCore {
                 events,
             ))
         });
-        if done.is_err()
-            && let Ok(mut state) = self.lock()
-            && matches!(*state, State::Ready(_))
-        {
-            *state = State::Over("a step has failed");
+        // The model that was trained so far remains.
+        if done.is_err() {
+            state.over = Some("a step has failed");
         }
         done
     }
@@ -164,17 +196,16 @@ impl TrainerCore {
         let folder = self.spec.output_folder().map_err(|failure| raise(py, &failure))?;
         detached(py, || Ok(RunFolder::check(&folder, overwrite)?))?;
         let listener = Listener::new(Some(listener), Some(stop))?;
-        let taken =
-            std::mem::replace(&mut *self.lock()?, State::Over("it has been trained to the end"));
-        match taken {
-            State::Ready(run) => {
-                listener.follow(py, |follower: &Follower| run.train(occupied, follower))
+        let taken = {
+            let mut state = self.lock()?;
+            if let Some(why) = state.over {
+                return Err(over(why));
             }
-            State::Over(why) => {
-                *self.lock()? = State::Over(why);
-                Err(PyRuntimeError::new_err(format!("this trainer cannot continue: {why}")))
-            }
-        }
+            state.over = Some(FINISHED);
+            state.run.take()
+        };
+        let run = taken.ok_or_else(|| over(FINISHED))?;
+        listener.follow(py, |follower: &Follower| run.train(occupied, follower))
     }
 
     /// The model in the dataset's own coordinates.
@@ -197,6 +228,7 @@ impl TrainerCore {
         let (rendering, normalisation) = self.with(py, |run| {
             let to_world = run.dataset.normalisation;
             let camera = to_world.scene_from_world_camera(&camera);
+            check_size(run, &camera)?;
             let backend = run.trainer.backend_and_history().0;
             let degree = backend.sh_degree();
             Ok((backend.render(&camera, background, degree)?, to_world))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,6 +14,9 @@ import densify
 
 #: Options of runs that take a fraction of a second.
 SMALL = {"iterations": 60, "budget": 300, "init_points": 200, "init": "random", "threads": 2, "backend": "cpu"}
+
+#: Windows has neither SIGINT for a single process nor names with `<`.
+not_on_windows = pytest.mark.skipif(sys.platform == "win32", reason="Windows cannot do this")
 
 
 @pytest.fixture(scope="session", autouse=True)

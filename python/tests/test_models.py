@@ -168,9 +168,21 @@ def test_wrong_datasets_are_refused(tmp_path: Path) -> None:
         with pytest.raises(error, match=message):
             densify.write_dataset(tmp_path / "new", **{**good, **change})
         assert not (tmp_path / "new").exists(), message
+    stacked = densify.write_dataset(tmp_path / "stacked", np.stack(images(3)), cameras(3))
+    assert sorted(path.name for path in stacked.iterdir()) == ["images", "transforms.json"]
     (tmp_path / "file").write_text("mine")
     with pytest.raises(densify.InputError, match="not empty"):
         densify.write_dataset(tmp_path, **good)
+
+
+def test_a_dataset_that_is_not_whole_is_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*paths: Any) -> None:
+        raise OSError("no space left")
+
+    monkeypatch.setattr("os.replace", fail)
+    with pytest.raises(OSError, match="no space left"):
+        densify.write_dataset(tmp_path / "new", images(3), cameras(3))
+    assert not (tmp_path / "new" / "transforms.json").exists()
 
 
 def test_a_dataset_in_memory_lasts_as_long_as_its_run(tmp_path: Path) -> None:

@@ -36,6 +36,8 @@ from .made import fails, make, train
         (lambda plan: plan.append([0.0, 0.0, 0.0], [0.5] * 3, 0.1, 0.5), ValueError, "shape"),
         (lambda plan: plan.append([["a", "b", "c"]], [0.5] * 3, 0.1, 0.5), TypeError, "numbers"),
         (lambda plan: plan.append([[0j, 0j, 0j]], [0.5] * 3, 0.1, 0.5), TypeError, "numbers"),
+        (lambda plan: plan.grow([0], densify.Offspring(scale=densify.by([1.0, 0.5, 0.2]))), ValueError, "three axes"),
+        (lambda plan: plan.append([[0.0] * 3] * 2, [0.5] * 3, [0.1, 0.2, 0.3], 0.5), ValueError, r"\[2, 3\]"),
         (lambda plan: plan.clamp_opacity(1.5), ValueError, "max"),
         (lambda plan: plan.decay(opacity=-1.0), ValueError, "opacity"),
         (lambda plan: plan.decay(seen_only=True), densify.Undeclared, "visible_count"),
@@ -83,8 +85,11 @@ def test_detailed_edits(scene: Path, tmp_path: Path) -> None:
         turned = densify.Offspring(children=[1, 2], scale=densify.by([[1.0, 0.5, 0.25]] * 2), turn=[0.0, 1.0, 0.0, 0.0])
         assert plan.grow([6, 7], turned).all()
         assert plan.grow([8], densify.split_long_axis(0.45, 0.6)).all()
-        assert plan.append([[0.0, 0.0, 0.0]], [0.5, 0.5, 0.5], [0.1, 0.2, 0.3], 0.5, [1.0, 0.0, 0.0, 0.0]).all()
+        # Three factors are one per row, and three columns are the axes, also for three rows.
+        for rows, factors in (([10, 11, 12], [0.5, 0.6, 0.7]), ([13, 14, 15], [[1.0, 0.5, 0.25]])):
+            assert plan.update(rows, scale=densify.by(factors)).all()
+        assert plan.append([[0.0, 0.0, 0.0]], [0.5, 0.5, 0.5], [[0.1, 0.2, 0.3]], 0.5, [1.0, 0.0, 0.0, 0.0]).all()
 
     policy = make("detailed", plan, needs={"detailed_edits": True}, every=60)
     (event,) = train(scene, policy, tmp_path / "run").events
-    assert (event["added"], event["updated"]) == (5, 6)
+    assert (event["added"], event["updated"]) == (5, 12)

@@ -128,6 +128,7 @@ def test_a_class_that_cannot_be_constructed_ends_the_run_before_it_begins(scene:
         ({"signals": ["opaciti"]}, "opaciti"),
         ({"least_resolution": 2.0}, "least_resolution is 2"),
         ({"full_depth": float("nan")}, "JSON"),
+        ({"scratch_bytes": 2**64 - 1}, "scratch_bytes"),
     ]:
         policy = make("unmade", lambda now, rng, plan: None, needs=needs, signals=needs.pop("signals", ()))
         with pytest.raises(densify.InputError, match=message):
@@ -167,6 +168,8 @@ def test_random_numbers_depend_on_the_seed_and_the_step(scene: Path, tmp_path: P
 
         def plan(now: densify.Now, rng: densify.Rng, plan: densify.Plan) -> None:
             rows, counts = rng.draw(now["opacity"], 50)
+            calls = [rng.uniform(50), rng.uniform(50), rng.normal(50)[:, 0], rng.normal(50)[:, 0]]
+            assert np.abs(np.corrcoef(calls) - np.eye(4)).max() < 0.6
             assert counts.sum() == 50 and rng.normal().shape == (now.rows, 3)
             chosen = rng.choice(now["opacity"], 5)
             drawn.append((rng.uniform(4).tolist(), rows.tolist(), chosen.tolist(), rng.generator().random()))
@@ -208,6 +211,65 @@ def test_state_that_is_not_json_ends_the_run(scene: Path, tmp_path: Path) -> Non
             train(scene, make("stateful", plan, count=densify.state(0)), tmp_path / str(number))
 
 
+def test_state_is_after_an_event_what_a_resume_restores(scene: Path, tmp_path: Path) -> None:
+    seen: list[Any] = []
+
+    def plan(self: Any, now: Any, rng: Any, plan: Any) -> None:
+        seen.append((list(self.table), self.one is self.two))
+        self.table = {"b": 1, "a": 2}
+        self.one = self.two = [1]
+
+    members = {"table": densify.state({}), "one": densify.state([]), "two": densify.state([])}
+    train(scene, make("orders", plan, **members), tmp_path / "run")
+    assert seen == [([], False)] + [(["a", "b"], False)] * 5
+    deep: Any = []
+    for _ in range(200):
+        deep = [deep]
+    for number, value in enumerate(["\ud800", deep]):
+
+        def unparsable(self: Any, now: Any, rng: Any, plan: Any) -> None:
+            self.count = value
+
+        with pytest.raises(densify.PolicyError, match="the state cannot be saved"):
+            train(scene, make("unparsable", unparsable, count=densify.state(0)), tmp_path / f"bad{number}")
+
+
+def test_a_subclass_is_a_policy_only_if_it_is_decorated(scene: Path, tmp_path: Path) -> None:
+    class Undecorated(Steady):
+        pass
+
+    for policy in (Undecorated, Undecorated()):
+        with pytest.raises(TypeError, match="@densify.policy"):
+            train(scene, policy, tmp_path / "run")
+
+    @densify.policy("often", summary="a test", source="a test")
+    class Often(Steady):
+        """# often
+
+        | name | default | range | unit | meaning |
+        |---|---|---|---|---|
+        | grow_every | 100 | >= 1 | steps | interval |
+        | grow_until | 15000 | >= 0 | step | end (exclusive) |
+        | more | 2 | >= 0 | | more |
+        """
+
+        more: int = 2
+
+    info = next(info for info in densify.policies() if info.name == "often")
+    assert info.parameters == {"grow_every": "100", "grow_until": "15000", "more": "2"}
+    assert Often(more=3).more == 3
+
+
+def test_copies_of_candidates_are_planned(scene: Path) -> None:
+    def bytes_of(capacity: int) -> int:
+        wanted = densify.Candidates(from_=1, until=50, rows_per_candidate=10, capacity=capacity)
+        policy = make("collects", lambda now, rng, plan: None, needs={"candidates": wanted})
+        return densify.plan(scene, policy=policy, budget=300, backend="cpu").total_bytes
+
+    # Once in the backend's list, and once in the copy that an event takes.
+    assert bytes_of(3_000_000) - bytes_of(1_000_000) == 2 * 32 * 2_000_000
+
+
 def test_other_attributes_cannot_be_set(scene: Path, tmp_path: Path) -> None:
     def plan(self: Any, now: Any, rng: Any, plan: Any) -> None:
         self.memory = 1
@@ -219,9 +281,12 @@ def test_the_pickle_of_another_program_is_no_state() -> None:
     from densify import _policy
 
     policy = make("pickled", lambda now, rng, plan: None, count=densify.state(0))()
-    for text in ["null", "[1]", '{"other": 1}', '{"count": "one"}', '{"count": 1, "more": 2}']:
+    for text in ["null", "[1]", '{"other": 1}', '{"count": 1, "more": 2}']:
         with pytest.raises(ValueError):
             _policy.restore_state(policy, text)
+    _policy.restore_state(policy, '{"count": 7}')
+    _policy.restore_state(policy, '{"count": 0.5}')
+    assert policy.count == 0.5
     _policy.restore_state(policy, '{"count": 7}')
     assert policy.count == 7 and json.loads(_policy.state_of(policy) or "") == {"count": 7}
 
@@ -350,6 +415,27 @@ def test_comparison_of_a_class(scene: Path, tmp_path: Path) -> None:
     local.__densify_policy__ = type(local.__densify_policy__)("local", None)  # type: ignore[attr-defined]
     with pytest.raises(densify.InputError, match="not in a file"):
         densify.compare(scene, [local], budget=220)
+
+
+def test_a_policy_by_name_brings_its_file(scene: Path, tmp_path: Path) -> None:
+    file = tmp_path / "named.py"
+    file.write_text((EXAMPLES / "steady.py").read_text().replace('"steady"', '"named"'))
+    densify.import_policies(str(file))
+    assert train(scene, "named", tmp_path / "run").config["policy_file"] == [str(file.resolve())]
+    compared = densify.compare(
+        scene,
+        ["named:grow_every=10", "vanilla"],
+        budget="0.22k",
+        seeds=1,
+        iterations=20,
+        output=tmp_path / "comparison",
+        progress=False,
+        threads=2,
+        backend="cpu",
+    )
+    assert "named" in compared.summary and len(compared.runs) == 2
+    with pytest.raises(ValueError, match="200k"):
+        densify.compare(scene, ["named"], budget="much", output=tmp_path / "other")
 
 
 def test_helpers_sort_as_in_rust() -> None:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import os
 import pickle
+import shutil
 import signal
 import subprocess
 import sys
@@ -17,7 +19,7 @@ import pytest
 
 import densify
 
-from .conftest import SMALL, cameras
+from .conftest import SMALL, cameras, not_on_windows
 
 
 def test_a_run_has_scores_curves_and_pictures(run: densify.Run, tmp_path: Path) -> None:
@@ -36,9 +38,13 @@ def test_a_run_has_scores_curves_and_pictures(run: densify.Run, tmp_path: Path) 
     page = run._repr_html_()
     assert page.count("data:image/png") == 2 and "PSNR" in page and "<svg" in page
     assert run.report(tmp_path / "report.html").stat().st_size > 10_000
+    with pytest.raises(densify.InputError, match="overwrite=True"):
+        run.report(tmp_path / "report.html")
+    assert run.report().samefile(run.report())
     assert run.export(tmp_path / "model.sog", progress=False).is_file()
 
 
+@not_on_windows
 def test_text_in_pages_is_escaped(scene: Path, tmp_path: Path) -> None:
     run = densify.train(scene, output=tmp_path / "<b>x", progress=False, **SMALL)
     assert "<b>x" not in run._repr_html_().replace("<b>&lt;b&gt;x", "")
@@ -111,6 +117,7 @@ def test_callbacks_and_their_exceptions(scene: Path, tmp_path: Path) -> None:
     assert (run.folder / model).read_bytes() == (tmp_path / "run" / model).read_bytes()
 
 
+@not_on_windows
 def test_ctrl_c_stops_between_two_steps_with_a_checkpoint(scene: Path, tmp_path: Path) -> None:
     def interrupt(step: int, loss: float, rows: int) -> None:
         if step == 7:
@@ -152,12 +159,21 @@ def test_a_trainer_is_stepped(scene: Path, tmp_path: Path) -> None:
             break
     with pytest.raises(densify.Interrupted, match="step 20"):
         list(trainer)
+    # The request is answered, so the loop can be entered again.
+    assert next(iter(trainer)).step == 21
+    with pytest.raises(densify.InputError, match=r"trainer\.model\(\)\.render"):
+        trainer.render(cameras(3, 64, 48)[1])
     assert len(trainer.model()) == trainer.rows and trainer.config["iterations"] == 60
     whole = densify.prepare(scene, output=tmp_path / "whole", **SMALL)
     assert [step.step for step in whole] == list(range(1, 61))
     run = densify.prepare(scene, output=tmp_path / "run", **SMALL).finish(progress=False)
     model = run.model()
     assert (model.means == whole.model().means).all() and (model.sh == whole.model().sh).all()
+    stopped = densify.prepare(scene, output=tmp_path / "stopped", **SMALL)
+    stopped.stop()
+    with pytest.raises(densify.Interrupted):
+        stopped.finish(progress=False)
+    assert not stopped._stop.asked
     with pytest.raises(TypeError):
         densify.Trainer()
     with pytest.raises(TypeError):
@@ -175,6 +191,78 @@ def test_a_trainer_that_has_failed_does_not_continue(scene: Path) -> None:
     for _ in range(2):
         with pytest.raises(RuntimeError, match="cannot continue: a step has failed"):
             trainer.step()
+    # What was trained remains.
+    assert len(trainer.model()) == trainer.rows == 200 and trainer.render(cameras(1)[0]).colour.shape == (24, 32, 3)
+
+
+@not_on_windows
+def test_ctrl_c_while_a_trainer_is_stepped(scene: Path) -> None:
+    from .made import make
+
+    def plan(now: densify.Now, rng: densify.Rng, plan: densify.Plan) -> None:
+        os.kill(os.getpid(), signal.SIGINT)
+
+    before = signal.getsignal(signal.SIGINT)
+    trainer = densify.prepare(scene, policy=make("kills", plan), **SMALL)
+    for loop in (lambda: list(trainer), lambda: [trainer.step() for _ in range(50)]):
+        done = trainer.steps_done
+        with pytest.raises(densify.Interrupted):
+            loop()
+        assert trainer.steps_done == done + 10 and signal.getsignal(signal.SIGINT) is before
+    # A suspended loop leaves Ctrl-C to the program.
+    loop_over = iter(trainer)
+    next(loop_over)
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_ctrl_c_while_a_run_is_measured(run: densify.Run) -> None:
+    from densify import _densify, _opened, _progress
+
+    opened = _opened._open(run, None, None, None, {"backend": "cpu"})
+    stop = _densify.Stop()
+    stop.ask(by_signal=True)
+    with pytest.raises(densify.Interrupted, match="SIGINT"):
+        opened.evaluate("test", lpips=None, fit_exposure=False, listener=_progress.Listener(False), stop=stop)
+
+
+def test_options_without_effect_are_refused(run: densify.Run, scene: Path, tmp_path: Path) -> None:
+    for option in ({"iterations": 7}, {"resolution": 8}, {"near": 0.1}):
+        (name,) = option
+        for call in (densify.evaluate, densify.render, densify.view):
+            with pytest.raises(densify.InputError, match=f"`{name}` has no effect"):
+                call(run, backend="cpu", **option)  # type: ignore[operator]
+    with pytest.raises(densify.InputError, match="`resolution` has no effect"):
+        densify.compress(run, tmp_path / "small.ply", to=100, progress=False, resolution=2)
+    model = run.export(tmp_path / "model.ply", progress=False)
+    assert densify.evaluate(model, scene=scene, resolution=2, backend="cpu").psnr > 1.0
+    with pytest.raises(densify.InputError, match="`budget` has no effect"):
+        densify.evaluate(model, scene=scene, budget=7)
+
+
+def test_a_run_is_opened_without_its_policies(run: densify.Run, tmp_path: Path) -> None:
+    """A run may come from a stranger: only training imports the Python files that it names."""
+    folder = tmp_path / "run"
+    shutil.copytree(run.folder, folder)
+    config, file, mark = folder / "config.toml", tmp_path / "policies.py", tmp_path / "imported"
+    file.write_text(f"open({os.fspath(mark)!r}, 'w').close()\n")
+    lines = [line for line in config.read_text().splitlines() if not line.startswith("policy_file")]
+    config.write_text("\n".join([f"policy_file = [{json.dumps(os.fspath(file))}]", *lines]) + "\n")
+    opened = densify.Run(folder)
+
+    def use() -> None:
+        assert opened.config["policy_file"] == [os.fspath(file)]
+        assert opened.evaluate().psnr > 1.0 and len(list(opened.render())) == 2
+        opened.report()
+        densify.compress(opened, tmp_path / "s.ply", to=50, iterations=1, progress=False, overwrite=True)
+        densify.view(opened, backend="cpu").close()
+
+    use()
+    assert not mark.exists()
+    file.unlink()
+    use()
+    # The file is read each time, as a run in training changes it.
+    config.write_text(config.read_text().replace("iterations = 60", "iterations = 61"))
+    assert opened.config["iterations"] == 61
 
 
 def test_a_trainer_in_use_by_another_thread(scene: Path) -> None:
@@ -250,6 +338,7 @@ def test_folders_that_are_no_runs(tmp_path: Path) -> None:
         densify.evaluate(tmp_path)
 
 
+@not_on_windows
 def test_the_command_is_the_same_program(run: densify.Run) -> None:
     def command(*words: str) -> subprocess.CompletedProcess[str]:
         return subprocess.run([sys.executable, "-m", "densify", *words], capture_output=True, text=True)

@@ -59,6 +59,8 @@ pub struct Needs {
     /// Memory that the policy itself takes at an event, beyond the values that every policy derives from its signals:
     /// copies for another language `[bytes per row]`.
     pub scratch_bytes: usize,
+    /// True if the policy copies candidates and the points of auxiliary views, as one in another language does.
+    pub copies_points: bool,
 }
 
 impl Needs {

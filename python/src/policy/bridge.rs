@@ -8,6 +8,7 @@ use densify_policies::policy::{
     PolicyState, SceneInfo, Snapshot,
 };
 use densify_policies::rng::PolicyRng;
+use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyTuple;
 
@@ -68,8 +69,8 @@ pub(super) struct PythonPolicy {
     scene: SceneInfo,
     needs: Needs,
     schedules: Schedules,
-    /// The state after the last event, as JSON text; `None` for a class without state.
-    state: Option<String>,
+    /// The state after the last event; `None` for a class without state.
+    state: Option<PolicyState>,
     /// An error of a method that cannot return one; it ends the run at the next plan, which is then due.
     pending: RefCell<Option<PolicyError>>,
 }
@@ -88,8 +89,14 @@ fn declared_needs(py: Python<'_>, object: &Py<PyAny>, scene: &SceneInfo) -> PyRe
     needs::parse(&helper(py, "needs_of", (object, view))?.extract::<String>()?)
 }
 
-fn state_of(py: Python<'_>, object: &Py<PyAny>) -> PyResult<Option<String>> {
-    helper(py, "state_of", (object,))?.extract()
+fn state_of(py: Python<'_>, object: &Py<PyAny>) -> PyResult<Option<PolicyState>> {
+    let text: Option<String> = helper(py, "state_of", (object,))?.extract()?;
+    let parse = |text: String| {
+        serde_json::from_str(&text).map_err(|error| {
+            PyValueError::new_err(format!("the state cannot be saved: {error} of its JSON"))
+        })
+    };
+    text.map(parse).transpose()
 }
 
 /// A number that `densify._policy.numbers_of` has taken from a class of the declarations.
@@ -287,8 +294,7 @@ impl DensityPolicy for PythonPolicy {
     }
 
     fn save(&self) -> PolicyState {
-        let state = self.state.as_deref().and_then(|text| serde_json::from_str(text).ok());
-        state.unwrap_or_default()
+        self.state.clone().unwrap_or_default()
     }
 
     fn restore(&mut self, state: PolicyState) -> PolicyResult {

@@ -10,7 +10,7 @@ use pyo3::exceptions::{PyRuntimeError, PyTypeError, PyValueError};
 use pyo3::prelude::*;
 
 use super::name_of;
-use super::offspring::{Offsprings, Opacities, Scales};
+use super::offspring::{Offsprings, Opacities, Scales, is_per_axis};
 use crate::arrays::{PerRow, floats, rows};
 use crate::errors::{Undeclared, in_use};
 
@@ -179,8 +179,7 @@ impl Plan {
         }
         let count = shape[0];
         let colour = PerRow::<3>::new(colour, count, "colour")?;
-        let (_, scale_shape) = floats(scale, "scale")?;
-        let is_per_axis = scale_shape.len() == 2 || (scale_shape == [3] && count != 3);
+        let is_per_axis = is_per_axis(scale, count)?;
         let axes = is_per_axis.then(|| PerRow::<3>::new(scale, count, "scale")).transpose()?;
         let round = (!is_per_axis).then(|| PerRow::<1>::new(scale, count, "scale")).transpose()?;
         let opacity = PerRow::<1>::new(opacity, count, "opacity")?;

@@ -11,6 +11,9 @@ use serde::Deserialize;
 /// Bytes per row that Python takes at an event besides its copies of the signals: masks, lists of rows, and arrays that
 /// a policy computes. A score of nine signals takes 20.
 const PYTHON_BYTES: usize = 32;
+/// Maximum of `scratch_bytes`: with as many bytes for each row, any number of rows that fits memory is counted without
+/// an overflow.
+const MAX_SCRATCH_BYTES: usize = 1 << 24;
 
 /// [`Needs`] as JSON, with the names of the Python class.
 #[derive(Deserialize)]
@@ -46,6 +49,12 @@ pub(super) fn parse(json: &str) -> PyResult<Needs> {
     let signals: SignalSet = declared.signals.into_iter().collect();
     let columns = declared.aux.as_ref().map_or(0, |aux| aux.columns.len());
     let copies = size_of::<f32>() * (signals.width() + columns);
+    if declared.scratch_bytes > MAX_SCRATCH_BYTES {
+        return Err(PyValueError::new_err(format!(
+            "needs: scratch_bytes is {}; it must be at most {MAX_SCRATCH_BYTES}, as it is for each row",
+            declared.scratch_bytes
+        )));
+    }
     let needs = Needs {
         signals,
         full_depth: declared.full_depth,
@@ -61,6 +70,7 @@ pub(super) fn parse(json: &str) -> PyResult<Needs> {
         start: declared.start.unwrap_or_default(),
         detailed_edits: declared.detailed_edits,
         scratch_bytes: copies + PYTHON_BYTES + declared.scratch_bytes,
+        copies_points: true,
     };
     needs.check().map_err(|problem| PyValueError::new_err(format!("needs: {problem}")))?;
     Ok(needs)

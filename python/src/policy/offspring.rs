@@ -50,21 +50,16 @@ fn unknown<T>(name: &str, kind: &str, known: &str) -> PyResult<T> {
 }
 
 impl Scales {
-    /// `by(factor)`, `by([x, y, z])`, `to(scale)`, `long_axis(long, other)`, or a factor.
+    /// `by(factor)`, `by([[x, y, z]])`, `to(scale)`, `long_axis(long, other)`, or a factor.
     pub(super) fn new(given: &Bound<'_, PyAny>, count: usize) -> PyResult<Self> {
         let name = "scale";
         if !given.hasattr("kind")? && given.extract::<String>().is_err() {
-            return Ok(Self::Uniform(PerRow::new(given, count, name)?));
+            return Self::factors(given, count);
         }
         let kind = kind_of(given, name)?;
         let value = given.getattr("value").ok();
         match (&*kind, value) {
-            ("by", Some(value))
-                if floats(&value, name)?.1.last() == Some(&3) && is_per_axis(&value, count)? =>
-            {
-                Ok(Self::Axes(PerRow::new(&value, count, name)?))
-            }
-            ("by", Some(value)) => Ok(Self::Uniform(PerRow::new(&value, count, name)?)),
+            ("by", Some(value)) => Self::factors(&value, count),
             ("to", Some(value)) => Ok(Self::Set(PerRow::new(&value, count, name)?)),
             ("long_axis", Some(value)) => {
                 let other = given.getattr("other")?;
@@ -75,6 +70,14 @@ impl Scales {
             }
             _ => unknown(name, &kind, "by, to, long_axis"),
         }
+    }
+
+    fn factors(value: &Bound<'_, PyAny>, count: usize) -> PyResult<Self> {
+        Ok(if is_per_axis(value, count)? {
+            Self::Axes(PerRow::new(value, count, "scale")?)
+        } else {
+            Self::Uniform(PerRow::new(value, count, "scale")?)
+        })
     }
 
     pub(super) fn at(&self, place: usize) -> ScaleRule {
@@ -89,10 +92,19 @@ impl Scales {
     }
 }
 
-/// True for three numbers for all rows, or three for each. Three numbers for three rows are one each.
-fn is_per_axis(value: &Bound<'_, PyAny>, count: usize) -> PyResult<bool> {
+/// True for scales of the three axes: an array of two dimensions, however many rows there are.
+///
+/// # Errors
+/// `ValueError` for three numbers for another number of rows: they may be meant for the axes.
+pub(super) fn is_per_axis(value: &Bound<'_, PyAny>, count: usize) -> PyResult<bool> {
     let (_, shape) = floats(value, "scale")?;
-    Ok(shape.len() == 2 || (shape.len() == 1 && count != 3))
+    if shape == [3] && count != 3 {
+        return Err(PyValueError::new_err(format!(
+            "scale: three numbers are one for each of three rows, but there are {count} rows; numbers for the three \
+             axes have the shape [1, 3] or [{count}, 3], such as [[x, y, z]]"
+        )));
+    }
+    Ok(shape.len() == 2)
 }
 
 impl Opacities {

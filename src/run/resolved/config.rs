@@ -205,7 +205,7 @@ impl RunConfig {
         let resolved = resolved.unwrap_or_else(|| Table::new().into());
         let resolved = Findings::deserialize(resolved)
             .map_err(|error| fail(&format!("resolved: {}", error.to_string().trim())))?;
-        let spec = Partial::new(table, origin)?.spec()?;
+        let spec = Partial::recorded(table, origin)?.spec()?;
         match (spec.size.budget.and_then(Budget::most), spec.size.sh_degree) {
             (Some(budget), Some(ShDegree::Fixed(sh_degree) | ShDegree::Auto(Some(sh_degree)))) => {
                 Ok(Self { densify, spec, resolved, budget, sh_degree })
@@ -275,7 +275,7 @@ fn in_shortest_decimals(mut table: Table) -> Table {
 #[cfg(test)]
 pub(crate) mod tests {
     use super::*;
-    use crate::spec::ByteCount;
+    use crate::spec::{ByteCount, PolicyFile};
     use densify_train::schedule::Background;
 
     #[test]
@@ -326,6 +326,22 @@ pub(crate) mod tests {
         // The file can also be passed to --config.
         let again = Partial::read(&root.path().join(CONFIG_FILE)).unwrap();
         assert_eq!(again.describe().unwrap(), sample().spec);
+    }
+
+    #[test]
+    fn a_run_is_read_without_its_policies() {
+        let root = tempfile::tempdir().unwrap();
+        let mut config = sample();
+        config.spec.density.policy_file = vec![PolicyFile("moved/away.py".into())];
+        config.spec.density.policy = "unknown".into();
+        config.spec.density.policy_set.push("unknown.rho=0.2".parse().unwrap());
+        config.write(root.path()).unwrap();
+        let read = RunConfig::read(root.path()).unwrap();
+        assert_eq!(read, config);
+        Partial::all(&read.spec).unwrap();
+        // A policy is needed to train, and in options that are given now.
+        read.spec.policy().unwrap_err();
+        Partial::read(&root.path().join(CONFIG_FILE)).unwrap_err();
     }
 
     #[test]

@@ -227,8 +227,14 @@ impl Case<'_> {
         // The policy keeps a point, makes a seed of it, and compiles the seed.
         let plan = bytes_per_row(needs) as u64;
         let own = needs.scratch_bytes as u64;
-        size.rows as u64 * ((signals + columns) * float + plan + PLANNING_BYTES + own)
-            + points * self.inputs.dataset.train.len() as u64 * (candidate + 3 * seed)
+        let points = points * self.inputs.dataset.train.len() as u64;
+        let candidates = needs.candidates.as_ref().map_or(0, |request| request.capacity as u64);
+        let copied = if needs.copies_points { candidates.saturating_add(points) } else { 0 };
+        let per_row = (signals + columns) * float + plan + PLANNING_BYTES + own;
+        (size.rows as u64)
+            .saturating_mul(per_row)
+            .saturating_add(points * (candidate + 3 * seed))
+            .saturating_add(copied.saturating_mul(candidate))
     }
 
     /// Bytes of the program and the dataset that have no other line in the ledger. The number does not depend on what

@@ -97,7 +97,8 @@ pub fn start(
 
 /// Overlays the saved options with those that are given.
 fn overlay(mut given: Partial, saved: &RunConfig, origin: &str) -> Result<RunSpec, Failure> {
-    let mut lower = Partial::all(&saved.spec)?;
+    // Training needs the policies of the saved run.
+    let mut lower = Partial::given(&saved.spec, |_| true)?;
     // `auto` stands for the decision that was saved.
     for option in ["budget", "sh_degree"] {
         let is_auto = |value: &Value| value.as_str().is_some_and(|text| text.starts_with("auto"));

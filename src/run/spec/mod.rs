@@ -90,6 +90,11 @@ macro_rules! run_spec {
                 )*
             }
 
+            impl $struct {
+                /// Names of the group's options.
+                pub const NAMES: &[&str] = &[$(stringify!($name)),*];
+            }
+
             impl Default for $struct {
                 fn default() -> Self {
                     Self { $($name: $default,)* }

@@ -34,10 +34,19 @@ impl Partial {
     /// # Errors
     /// Names the key, the expected values, and the nearest valid name.
     pub fn new(table: Table, origin: &str) -> Result<Self, Failure> {
-        Self::checked(table).map_err(|failure| failure.within(origin))
+        Self::checked(table, check_policies).map_err(|failure| failure.within(origin))
     }
 
-    fn checked(table: Table) -> Result<Self, Failure> {
+    /// Checks the table of a run that was made before, as [`new`](Self::new) does, except its policies: reading a run
+    /// must not import the Python files that it names.
+    pub(crate) fn recorded(table: Table, origin: &str) -> Result<Self, Failure> {
+        Self::checked(table, |_| Ok(())).map_err(|failure| failure.within(origin))
+    }
+
+    fn checked(
+        table: Table,
+        check_more: impl Fn(&RunSpec) -> Result<(), Failure>,
+    ) -> Result<Self, Failure> {
         for (name, value) in &table {
             if RunOption::find(name).is_none() {
                 let nearest = nearest(name, OPTIONS.iter().map(|option| option.name));
@@ -49,7 +58,9 @@ impl Partial {
                 origin: name.clone(),
                 problem: error.to_string().trim().to_owned(),
             };
-            check_names(&spec.map_err(malformed)?)?;
+            let spec = spec.map_err(malformed)?;
+            check_names(&spec)?;
+            check_more(&spec)?;
         }
         Ok(Self(table))
     }
@@ -65,7 +76,7 @@ impl Partial {
                 .parse()
                 .map_err(|error: toml::de::Error| Failure::input(error.to_string().trim()))?;
             table.retain(|key, _| !NOT_OPTIONS.contains(&key));
-            Self::checked(table)
+            Self::checked(table, check_policies)
         };
         read().map_err(|failure| failure.within_option("config", Some(path.display().to_string())))
     }
@@ -75,17 +86,18 @@ impl Partial {
     /// # Errors
     /// When a value is invalid.
     pub fn given(spec: &RunSpec, is_given: impl Fn(&str) -> bool) -> Result<Self, Failure> {
-        let all = spec.table()?;
-        check_names(spec)?;
+        let Self(all) = Self::all(spec)?;
+        check_policies(spec)?;
         Ok(Self(all.into_iter().filter(|(name, _)| is_given(name)).collect()))
     }
 
-    /// All options of a description.
+    /// All options of a description. Its policies are not looked up.
     ///
     /// # Errors
     /// When a value is invalid.
     pub fn all(spec: &RunSpec) -> Result<Self, Failure> {
-        Self::given(spec, |_| true)
+        check_names(spec)?;
+        Ok(Self(spec.table()?))
     }
 
     /// A single option.
@@ -171,20 +183,25 @@ fn join(upper: Table, lower: &mut Table) {
     }
 }
 
-/// Checks the names in options that have several members: knobs, learning rates, policies.
+/// Checks the names in options that have several members: knobs, learning rates, settings of policies.
 fn check_names(spec: &RunSpec) -> Result<(), Failure> {
-    spec.import_policies()?;
     spec.knobs()?;
     spec.learning_rates(&RateOverrides::default(), 1.0)?;
     for setting in &spec.density.policy_set {
-        if let [policy, _] = &setting.path[..] {
-            densify_policies::registry::find(policy)
-                .map_err(|error| OptionProblem::value("policy_set", error))?;
-        } else {
+        if setting.path.len() != 2 {
             let name = setting.path.join(".");
             let setting = format!("{name}={}", setting.value);
             return Err(OptionProblem::PolicySetting { setting }.into());
         }
     }
     Ok(())
+}
+
+/// Imports the policies of `policy_file`, and checks that those in `policy_set` exist.
+fn check_policies(spec: &RunSpec) -> Result<(), Failure> {
+    spec.import_policies()?;
+    spec.density.policy_set.iter().filter_map(|setting| setting.path.first()).try_for_each(|name| {
+        let found = densify_policies::registry::find(name);
+        found.map(drop).map_err(|error| OptionProblem::value("policy_set", error).into())
+    })
 }
