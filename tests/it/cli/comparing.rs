@@ -218,7 +218,10 @@ fn scheduler_runs_match_local_ones_and_are_collected_by_repeating_the_call() {
     let text_of_script = read_text(&script);
     // The memory includes what the process measures of itself, which varies.
     let without_memory = |text: &str| {
-        text.lines().filter(|line| !line.starts_with("#SBATCH --mem=")).collect::<Vec<_>>().join("\n")
+        text.lines()
+            .filter(|line| !line.starts_with("#SBATCH --mem="))
+            .collect::<Vec<_>>()
+            .join("\n")
     };
     assert!(without_memory(&shown).contains(&without_memory(&text_of_script)), "{shown}");
     assert!(text_of_script.contains("#SBATCH --array=0,1,2,3,4,5,6,7\n"), "{text_of_script}");
