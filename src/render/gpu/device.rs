@@ -302,7 +302,7 @@ mod tests {
 
     use super::super::adapter::adapters;
     use super::*;
-    use crate::{AdapterKind, Backend, Inspect};
+    use crate::{AdapterKind, Backend, Fit, Inspect};
     use densify_core::camera::Camera;
 
     /// A newly opened software driver, as a lost device cannot be used again. Not SwiftShader, which opens slowly.

@@ -32,7 +32,7 @@ impl GpuBackend {
         for array in self.sizes.parameters() {
             for piece in pieces(model.len()) {
                 let first = 4 * (piece.start * array.numbers) as u64;
-                let values = gather(model, array, piece);
+                let values = gather(model, &array, piece);
                 self.write_at(array.name, first, &array.words_of(&values));
             }
         }
