@@ -14,7 +14,7 @@ use densify_run::{Partial, RunSpec};
 /// Maximum number of rows of the table of differences; more would not be readable.
 const MAX_DIFFERENCES: usize = 60;
 /// Options that are paths on the machine that trained the run; only their last component is published.
-const PATHS: [&str; 6] = ["scene", "images", "sparse", "views", "init", "freeze"];
+const PATHS: [&str; 7] = ["scene", "images", "sparse", "views", "init", "freeze", "policy_file"];
 
 /// All options with their full names, such as `knob.alpha_min`, and their values as text.
 pub(super) fn flatten(options: &Table) -> BTreeMap<String, String> {
@@ -38,8 +38,15 @@ fn published(spec: &RunSpec) -> Result<Table, Failure> {
     let mut all = Partial::all(spec)?.into_table();
     all.remove("output");
     for name in PATHS {
-        if let Some(Value::String(text)) = all.get_mut(name) {
-            *text = scene_name(text.as_ref());
+        let values = match all.get_mut(name) {
+            Some(Value::Array(values)) => values.as_mut_slice(),
+            Some(value) => std::slice::from_mut(value),
+            None => &mut [],
+        };
+        for value in values {
+            if let Value::String(text) = value {
+                *text = scene_name(text.as_ref());
+            }
         }
     }
     Ok(all)
@@ -103,7 +110,7 @@ mod tests {
     use clap::Args;
 
     use super::*;
-    use densify_run::AbsolutePath;
+    use densify_run::{AbsolutePath, PolicyFile};
 
     /// An option is a path if its value is called a file, folder, model or scene in `--help`.
     #[test]
@@ -138,8 +145,11 @@ mod tests {
         spec.data.images = Some("/mnt/photographs".into());
         spec.data.views = Some(AbsolutePath("/mnt/views.txt".into()));
         spec.start.freeze = Some(AbsolutePath("/mnt/rest.ply".into()));
+        spec.density.policy_file = vec![PolicyFile("/home/somebody/steady.py".into())];
         let text = toml::to_string(&published(&spec).unwrap()).unwrap();
-        assert!(text.contains("scene = \"garden\"") && text.contains("\"photographs\""), "{text}");
+        for name in ["scene = \"garden\"", "\"photographs\"", "\"steady.py\""] {
+            assert!(text.contains(name), "{text}");
+        }
         assert!(!text.contains("somebody") && !text.contains("mnt"), "{text}");
     }
 }
