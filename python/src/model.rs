@@ -15,7 +15,7 @@ use crate::arrays::{floats, shaped};
 use crate::camera::{CameraParts, arrays, camera};
 use crate::errors::detached;
 use crate::follow::Listener;
-use crate::{options, tools};
+use crate::options;
 
 /// A model: one entry per Gaussian in each array. All arrays are copies.
 #[pyclass(module = "densify._densify", name = "ModelArrays", frozen)]
@@ -137,9 +137,9 @@ impl Model {
         overwrite: bool,
         listener: Option<&Bound<'_, PyAny>>,
     ) -> PyResult<()> {
-        let coordinates: Coordinates = tools::word("coordinates", coordinates)?;
+        let coordinates: Coordinates = options::word("coordinates", coordinates)?;
         Listener::new(listener, None)?.follow(py, move |follower| {
-            tools::check_output(&path, overwrite)?;
+            options::check_output(&path, overwrite)?;
             let format = match format {
                 Some(name) => {
                     find(name).map_err(|error| Failure::input(format!("format: {error}")))?

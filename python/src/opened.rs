@@ -2,7 +2,7 @@
 
 use std::ops::ControlFlow;
 use std::path::PathBuf;
-use std::sync::{Mutex, TryLockError};
+use std::sync::{Mutex, MutexGuard, TryLockError};
 
 use densify_data::views::{DatasetViews, ViewSource};
 use densify_run::RunConfig;
@@ -20,7 +20,7 @@ use pyo3::prelude::*;
 use crate::camera::{CameraParts, arrays, parts, photograph};
 use crate::errors::{detached, in_use};
 use crate::follow::{Listener, Stop};
-use crate::{model, options, tools};
+use crate::{model, options};
 
 /// A model with its dataset.
 #[pyclass(module = "densify._densify", frozen)]
@@ -77,16 +77,20 @@ pub(crate) fn open_model(
 }
 
 impl OpenedModel {
+    fn lock(&self) -> PyResult<MutexGuard<'_, Opened>> {
+        match self.opened.try_lock() {
+            Ok(guard) => Ok(guard),
+            Err(TryLockError::Poisoned(poisoned)) => Ok(poisoned.into_inner()),
+            Err(TryLockError::WouldBlock) => Err(in_use("the model")),
+        }
+    }
+
     fn with<T: Send>(
         &self,
         py: Python<'_>,
         work: impl FnOnce(&mut Opened) -> Result<T, Failure> + Send,
     ) -> PyResult<T> {
-        let mut guard = match self.opened.try_lock() {
-            Ok(guard) => guard,
-            Err(TryLockError::Poisoned(poisoned)) => poisoned.into_inner(),
-            Err(TryLockError::WouldBlock) => return Err(in_use("the model")),
-        };
+        let mut guard = self.lock()?;
         let opened = &mut *guard;
         detached(py, move || work(opened))
     }
@@ -105,7 +109,7 @@ fn view_at(views: &DatasetViews, view: usize) -> Result<usize, Failure> {
 impl OpenedModel {
     /// Names and cameras of the views of a split, in the dataset's own coordinates.
     fn views(&self, py: Python<'_>, split: &str) -> PyResult<Vec<(String, CameraParts)>> {
-        let split: Split = tools::word("split", split)?;
+        let split: Split = options::word("split", split)?;
         self.with(py, |opened| {
             let to_world = opened.dataset.normalisation;
             let views = opened.views(split)?;
@@ -125,7 +129,7 @@ impl OpenedModel {
         split: &str,
         view: usize,
     ) -> PyResult<((Py<PyAny>, Py<PyAny>, Py<PyAny>), Py<PyAny>)> {
-        let split: Split = tools::word("split", split)?;
+        let split: Split = options::word("split", split)?;
         let (rendering, image, normalisation) = self.with(py, |opened| {
             let views = opened.views(split)?;
             let view = view_at(&views, view)?;
@@ -150,12 +154,8 @@ impl OpenedModel {
         listener: &Bound<'_, PyAny>,
         stop: &Bound<'_, Stop>,
     ) -> PyResult<String> {
-        let split: Split = tools::word("split", split)?;
-        let mut guard = match self.opened.try_lock() {
-            Ok(guard) => guard,
-            Err(TryLockError::Poisoned(poisoned)) => poisoned.into_inner(),
-            Err(TryLockError::WouldBlock) => return Err(in_use("the model")),
-        };
+        let split: Split = options::word("split", split)?;
+        let mut guard = self.lock()?;
         let opened = &mut *guard;
         Listener::new(Some(listener), Some(stop))?.follow(py, move |follower| {
             use densify_run::Observer;

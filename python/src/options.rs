@@ -1,7 +1,12 @@
-//! Options of a run from Python: keyword arguments, which arrive as JSON and are checked as a TOML table.
+//! Checks of keyword arguments: options of a run, which arrive as JSON and are checked as a TOML table, words and files.
+
+use std::path::Path;
 
 use densify_run::failure::Failure;
 use densify_run::{DataSpec, DeviceSpec, Partial, RunSpec};
+use pyo3::PyResult;
+use pyo3::exceptions::PyValueError;
+use serde::de::DeserializeOwned;
 use toml::{Table, Value};
 
 /// The origin of options in messages.
@@ -71,4 +76,25 @@ pub(crate) fn for_model(json: &str, is_run: bool, more: &[&str]) -> Result<RunSp
 /// The run that a JSON object describes, over its preset and the defaults.
 pub(crate) fn spec(json: &str) -> Result<RunSpec, Failure> {
     partial(json)?.describe()
+}
+
+/// A word of an enumeration, as files spell it.
+pub(crate) fn word<T: DeserializeOwned>(name: &str, text: &str) -> PyResult<T> {
+    serde_json::from_value(serde_json::Value::from(text))
+        .map_err(|error| PyValueError::new_err(format!("{name}: {error}")))
+}
+
+/// Fails if a file would replace something that it must not.
+pub(crate) fn check_output(path: &Path, overwrite: bool) -> Result<(), Failure> {
+    let shown = path.display();
+    match path.symlink_metadata() {
+        Ok(_) if path.is_dir() => Err(Failure::input(format!("{shown} is a folder; name a file"))),
+        Ok(_) if path.exists() && !path.is_file() => {
+            Err(Failure::input(format!("{shown} is a device or a pipe; name a file")))
+        }
+        Ok(_) if !overwrite => Err(Failure::input(format!(
+            "{shown} exists; choose another file, or replace it with overwrite=True"
+        ))),
+        _ => Ok(()),
+    }
 }

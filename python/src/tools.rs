@@ -1,6 +1,6 @@
 //! What the other commands do, as functions: they return data, and report to a Python object.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use densify_compress as compressing;
 use densify_core::numbers;
@@ -14,32 +14,10 @@ use densify_scenegen::{self as generator, Scene, Source};
 use densify_study::{Comparison, SceneBudget};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
-use serde::de::DeserializeOwned;
 
 use crate::follow::{Listener, Stop};
 use crate::training::ledger_lines;
 use crate::{model, options};
-
-/// A word of an enumeration, as files spell it.
-pub(crate) fn word<T: DeserializeOwned>(name: &str, text: &str) -> PyResult<T> {
-    serde_json::from_value(serde_json::Value::from(text))
-        .map_err(|error| PyValueError::new_err(format!("{name}: {error}")))
-}
-
-/// Fails if a file would replace something that it must not.
-pub(crate) fn check_output(path: &Path, overwrite: bool) -> Result<(), Failure> {
-    let shown = path.display();
-    match path.symlink_metadata() {
-        Ok(_) if path.is_dir() => Err(Failure::input(format!("{shown} is a folder; name a file"))),
-        Ok(_) if path.exists() && !path.is_file() => {
-            Err(Failure::input(format!("{shown} is a device or a pipe; name a file")))
-        }
-        Ok(_) if !overwrite => Err(Failure::input(format!(
-            "{shown} exists; choose another file, or replace it with overwrite=True"
-        ))),
-        _ => Ok(()),
-    }
-}
 
 type Alternatives = (u64, Vec<(u32, (u32, u32))>, Vec<Vec<Option<usize>>>);
 type PlanParts = (Vec<(&'static str, String, u64)>, u64, Vec<String>, Alternatives);
@@ -92,7 +70,7 @@ pub(crate) fn compress(
             None => vec![find_by_extension(&output)?],
         };
         for format in &formats {
-            check_output(&compressing::file(&output, &formats, format), overwrite)?;
+            options::check_output(&compressing::file(&output, &formats, format), overwrite)?;
         }
         let to = match (to_rows, to_bytes) {
             (Some(rows), None) if rows > 0 => compressing::Target::Rows(rows),
@@ -273,7 +251,7 @@ pub(crate) fn report(
 ) -> PyResult<()> {
     Listener::new(Some(listener), None)?.follow(py, move |follower| {
         let spec = options::spec(options)?;
-        check_output(&output, overwrite)?;
+        options::check_output(&output, overwrite)?;
         let options = ReportOptions {
             runs: &runs,
             iteration,
