@@ -48,7 +48,8 @@ use std::process::ExitCode;
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 
 use console::Console;
-use densify_run::failure;
+use densify_render::cpu::InstructionSet;
+use densify_run::failure::{self, Failure};
 #[cfg(not(feature = "gpu"))]
 use without::devices;
 #[cfg(not(feature = "selftest"))]
@@ -157,7 +158,8 @@ pub fn run_with(arguments: impl IntoIterator<Item = impl Into<OsString> + Clone>
     };
     let console = Console::new(quiet);
     let (_, given) = matches.subcommand().unwrap_or(("", &matches));
-    let done = match arguments.command {
+    let instructions = InstructionSet::from_environment().map_err(Failure::input);
+    let done = instructions.and_then(|_| match arguments.command {
         Command::Train(train) => train::run(&train, given, &console),
         Command::Blocks(args) => blocks::run(&args, &console),
         Command::Plan(train) => plan::run(&train, given, &console),
@@ -175,7 +177,7 @@ pub fn run_with(arguments: impl IntoIterator<Item = impl Into<OsString> + Clone>
         Command::Trade(trade) => study::trade(&trade, &console),
         Command::Selftest(selftest) => selftest::run(&selftest, &console),
         Command::View(view) => view::run(&view, given, &console),
-    };
+    });
     match done.and_then(|()| console.finish()) {
         Ok(()) => 0,
         Err(failure) => {

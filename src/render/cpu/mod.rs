@@ -79,7 +79,7 @@ use summed::GradientSums;
 use threads::Threads;
 use tiles::TileLists;
 
-pub use instructions::InstructionSet;
+pub use instructions::{INSTRUCTIONS_VARIABLE, InstructionSet};
 pub use optimise::ModelGradient;
 pub use threads::StepTasks;
 #[cfg(feature = "gpu")]

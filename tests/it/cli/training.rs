@@ -2,10 +2,14 @@
 
 use std::path::Path;
 
+use assert_cmd::Command;
 use densify_policies::registry::{find, policies};
 use serde_json::Value;
 
-use super::{Outcome, config, count, files, frequent_edits, json, model, records, scratch, train};
+use super::{
+    Outcome, WITHOUT_GPU, config, count, files, frequent_edits, json, model, outcome_of, records,
+    scratch, text, train,
+};
 use crate::photographs::{POINTS, Photographs, VIEWS};
 
 const ITERATIONS: u32 = 100;
@@ -222,4 +226,30 @@ fn reinitialisation_stays_within_the_budget() {
     let summary = json(&run.join("stats/summary.json"));
     assert_eq!(count(&summary, "extra_forwards"), views);
     assert!(count(&summary, "peak_rows") <= 330);
+}
+
+#[test]
+fn instruction_sets_are_chosen_by_the_environment() {
+    let call = |set: &str, arguments: &[&str]| {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_densify"));
+        command.args(arguments).env("DENSIFY_INSTRUCTIONS", set).envs([WITHOUT_GPU]);
+        command.env("XDG_CACHE_HOME", env!("CARGO_TARGET_TMPDIR"));
+        outcome_of(command)
+    };
+    call("avx9", &["knobs"]).refused("avx9", &["DENSIFY_INSTRUCTIONS", "`avx9`", "scalar"]);
+    let (_kept, folder) = scratch();
+    let trained = |set: &str| {
+        let run = folder.join(set);
+        let fixed = "train scene:spheres --backend cpu -i 5 -b 300 --quiet -o";
+        let mut arguments: Vec<&str> = fixed.split(' ').collect();
+        arguments.push(text(&run));
+        call(set, &arguments).ok();
+        model(&run, 5)
+    };
+    let [best, scalar] = ["best", "scalar"].map(trained);
+    assert_eq!(best.len(), scalar.len());
+    // Sums are added in another order, so the last bits differ where there are vectors.
+    if cfg!(any(target_arch = "x86_64", target_arch = "aarch64")) {
+        assert_ne!(best, scalar);
+    }
 }
