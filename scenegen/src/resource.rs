@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 use base64::Engine as _;
 use base64::alphabet::{STANDARD, URL_SAFE};
 use base64::engine::{DecodePaddingMode, GeneralPurpose, GeneralPurposeConfig};
-use image::{ImageFormat, ImageReader, Limits};
+use image::{ImageFormat, ImageReader, Limits, RgbaImage};
 
 use crate::error::Error;
 use crate::mesh::Model;
@@ -234,13 +234,19 @@ pub(crate) fn image_reader<'a>(
     Ok(reader)
 }
 
-/// Decodes a PNG, JPEG or WebP image.
+/// Decodes a PNG, JPEG or WebP image as a texture.
 pub(crate) fn decode(
     file: &Path,
     element: &str,
     bytes: &[u8],
     srgb: bool,
 ) -> Result<Texture, Error> {
+    let image = decode_image(file, element, bytes)?;
+    Ok(Texture::new(image.width(), image.height(), image.into_raw(), srgb))
+}
+
+/// Decodes a PNG, JPEG or WebP image.
+pub(crate) fn decode_image(file: &Path, element: &str, bytes: &[u8]) -> Result<RgbaImage, Error> {
     let remedy = "store it as a PNG or JPEG of at most 16384 px a side";
     let fault = |problem: String| Error::malformed(file, element, problem, remedy);
     let problem = "it is neither PNG, JPEG nor WebP";
@@ -249,8 +255,7 @@ pub(crate) fn decode(
     if width > MAX_SIDE || height > MAX_SIDE || u64::from(width) * u64::from(height) > MAX_PIXELS {
         return Err(fault(format!("it has {width}x{height} px")));
     }
-    let image = reader()?.decode().map_err(|e| fault(e.to_string()))?.into_rgba8();
-    Ok(Texture::new(width, height, image.into_raw(), srgb))
+    Ok(reader()?.decode().map_err(|e| fault(e.to_string()))?.into_rgba8())
 }
 
 #[cfg(test)]

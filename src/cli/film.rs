@@ -65,6 +65,9 @@ pub(super) fn run(
         video: args.video.as_deref(),
     };
     let film = Film::make(route, options, output, channels, source).map_err(with_option_names)?;
+    if let (Some(note), CameraRoute::File(path)) = (film.note, route) {
+        console.say(format_args!("note: {}: {note}", path.display()));
+    }
     console.result(format_args!("{} frames in {}", film.frames, output.display()));
     if let Some(video) = &args.video {
         console.result(format_args!("film in {}", video.display()));

@@ -111,7 +111,7 @@ impl LoadError {
     /// A lens model that is not one of those supported.
     pub(crate) fn lens_model(path: &Path, field: &str, model: &str, supported: &str) -> Self {
         let problem = format!("the camera model {model} is not one of {supported}");
-        if model != "EQUIRECTANGULAR" {
+        if !matches!(model, "EQUIRECTANGULAR" | "SPHERICAL") {
             return Self::lens(path, field, problem);
         }
         let remedy = "cut the panoramas into the faces of a cube and reconstruct the scene from these, as COLMAP's \
@@ -140,9 +140,15 @@ impl LoadError {
         ))
     }
 
-    /// An image named in a field of a file does not exist.
-    pub(crate) fn missing_image(path: &Path, field: &str, image: &Path) -> Self {
-        let problem = format!("the file {} does not exist", image.display());
+    /// An image named in a field of a file does not exist, but perhaps one that has only another extension, `namesake`.
+    pub(crate) fn missing_image(
+        path: &Path,
+        field: &str,
+        image: &Path,
+        namesake: Option<&str>,
+    ) -> Self {
+        let other = namesake.map_or_else(String::new, |other| format!(", but {other} does"));
+        let problem = format!("the file {} does not exist{other}", image.display());
         Self::remedied(path, field, problem, LoadRemedy::RestoreOrImagesFolder)
     }
 }

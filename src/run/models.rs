@@ -19,7 +19,7 @@ use densify_train::output::{is_in_use, model_path, saved_iterations};
 
 /// True for a file that is not the archive of a dataset, and for a folder in SOG format.
 pub fn is_model(path: &Path) -> bool {
-    (path.is_file() && !is_archive(path)) || path.join("meta.json").is_file()
+    (path.is_file() && !is_archive(path)) || models::is_model_folder(path)
 }
 
 /// The iteration `asked` for, or else the last one that the run has saved.

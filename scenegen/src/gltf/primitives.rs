@@ -2,6 +2,7 @@
 
 use glam::{DAffine3, DVec3, Vec2, Vec3, Vec4};
 use gltf::json;
+use json::accessor::ComponentType;
 use json::mesh::{Mode, MorphTarget, Primitive, Semantic};
 use json::validation::Checked;
 
@@ -65,6 +66,7 @@ impl Reader<'_> {
         let tangents = read(Semantic::Tangents, &[4])?;
         let uvs = [read(Semantic::TexCoords(0), &[2])?, read(Semantic::TexCoords(1), &[2])?];
         let colours = read(Semantic::Colors(0), &[3, 4])?;
+        self.refuse_plain_integers(&source)?;
         let indices = match primitive.indices {
             Some(index) => self.buffers.indices(index.value(), element)?,
             None => (0..u32::try_from(count).unwrap_or(u32::MAX)).collect(),
@@ -132,6 +134,23 @@ impl Reader<'_> {
             model.triangle_materials.resize(model.triangles.len(), material);
         }
         Ok(())
+    }
+
+    /// Refuses colours in integers that are not normalised, as their range is not defined (glTF 2.0, 3.7.2.1).
+    fn refuse_plain_integers(&self, source: &Source<'_>) -> Result<(), Error> {
+        let accessor = source.accessor(Semantic::Colors(0));
+        let Some(accessor) = accessor.and_then(|index| self.root.accessors.get(index)) else {
+            return Ok(());
+        };
+        let float = ComponentType::F32;
+        let is_float =
+            matches!(&accessor.component_type, Checked::Valid(component) if component.0 == float);
+        if is_float || accessor.normalized {
+            return Ok(());
+        }
+        let element = format!("{} COLOR_0", source.element);
+        let problem = "its integers are not marked as normalized, so that their range is unknown";
+        Err(self.fault(element, problem))
     }
 
     /// Refuses a primitive whose geometry only an extension defines.

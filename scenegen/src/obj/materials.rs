@@ -4,15 +4,21 @@ use std::collections::{HashMap, HashSet};
 use std::path::{Path, PathBuf};
 
 use glam::{Vec2, Vec3};
+use image::RgbaImage;
 
 use super::statements::{self, Statement, split_word};
 use crate::error::Error;
 use crate::mesh::{AlphaMode, Material, Model, Reflection};
 use crate::resource::{self, Folder, shortened};
-use crate::texture::{TextureRef, Wrap};
+use crate::texture::{Texture, TextureRef, Wrap};
 
 /// Linear base colour of materials without a colour, and of faces without a material.
 pub(super) const GREY: f32 = 0.6;
+
+/// The keys of the maps that are read.
+const MAPS: [&str; 6] = ["map_kd", "map_d", "map_ke", "norm", "map_pr", "map_pm"];
+/// Base and gain of a map without the option `-mm`.
+const WHOLE_RANGE: [f32; 2] = [0.0, 1.0];
 
 /// A material's statements (line, key as written, text) by key in lower case, as programs differ in case. Of several
 /// statements with the same key, the last counts.
@@ -23,8 +29,8 @@ pub(super) struct Materials {
     folder: Folder,
     /// The model's indices of materials by name; `None` for those already noted as missing.
     indices: HashMap<String, Option<u32>>,
-    /// The model's indices of textures, by file and colour space (true for sRGB).
-    textures: HashMap<(PathBuf, bool), u32>,
+    /// The model's indices of textures, by file, colour space (true for sRGB), and base and gain (as bits).
+    textures: HashMap<(PathBuf, bool, [u32; 2]), u32>,
     /// The model's indices of materials with neither colour nor texture, which show vertex colours if there are any.
     pub(super) uncoloured: HashSet<u32>,
     /// The model that materials, textures and notes are added to.
@@ -176,11 +182,24 @@ impl Materials {
         if base_texture.is_none() && kd.is_none_or(|kd| kd == Vec3::ZERO) {
             self.uncoloured.insert(number);
         }
+        let name_shown = shortened(name);
         if map("bump").or(map("map_bump")).is_some() {
-            let name = shortened(name);
             self.model.notes.push(format!(
-                "material {name}: bump maps are not supported; store a normal map (norm) instead"
+                "material {name_shown}: bump maps are not supported; store a normal map (norm) instead"
             ));
+        }
+        for key in MAPS {
+            let Some(map) = map(key) else { continue };
+            if map.is_turbulent {
+                self.model.notes.push(format!(
+                    "material {name_shown}: the turbulence -t of {key} is not supported and ignored"
+                ));
+            }
+            if key == "map_d" && shares_alpha && map.range != WHOLE_RANGE {
+                self.model.notes.push(format!(
+                    "material {name_shown}: -mm of {key} is ignored, as the map is an alpha channel"
+                ));
+            }
         }
         self.indices.insert(name.to_owned(), Some(number));
         Ok(())
@@ -190,12 +209,14 @@ impl Materials {
         let library = path.file_name().unwrap_or_default().to_string_lossy();
         let element = format!("{library} line {}: texture", map.line);
         let file = self.resolve(&element, &map.file)?;
-        let key = (file.clone(), srgb);
+        let key = (file.clone(), srgb, map.range.map(f32::to_bits));
         let number = match self.textures.get(&key) {
             Some(&number) => number,
             None => {
                 let bytes = self.folder.read(&element, &file)?;
-                let texture = resource::decode(&file, &element, &bytes, srgb)?;
+                let mut image = resource::decode_image(&file, &element, &bytes)?;
+                map.change_range(&mut image);
+                let texture = Texture::new(image.width(), image.height(), image.into_raw(), srgb);
                 let number = resource::add_texture(path, &element, &mut self.model, texture)?;
                 self.textures.insert(key, number);
                 number
@@ -246,14 +267,25 @@ pub(super) struct Map {
     pub(super) scale: Vec2,
     pub(super) offset: Vec2,
     pub(super) clamp: bool,
+    /// Base and gain: a value v of the image, from 0 to 1, becomes base + gain·v.
+    pub(super) range: [f32; 2],
+    /// True if the coordinates are to be distorted by noise.
+    pub(super) is_turbulent: bool,
 }
 
 impl Map {
     /// Parses options, and a file name that may contain spaces; `None` if there is no name.
     pub(super) fn read(statement: Statement<'_>) -> Option<Self> {
         let Statement { line, text: mut rest, .. } = statement;
-        let mut map =
-            Self { line, file: String::new(), scale: Vec2::ONE, offset: Vec2::ZERO, clamp: false };
+        let mut map = Self {
+            line,
+            file: String::new(),
+            scale: Vec2::ONE,
+            offset: Vec2::ZERO,
+            clamp: false,
+            range: WHOLE_RANGE,
+            is_turbulent: false,
+        };
         while rest.starts_with('-') {
             let (option, mut after) = split_word(rest);
             // Some options take up to three numbers, of which the later ones are optional.
@@ -282,12 +314,31 @@ impl Map {
             match option {
                 "-o" => map.offset = pair(0.0),
                 "-s" => map.scale = pair(1.0),
+                "-t" => map.is_turbulent = values.iter().any(|value| *value != 0.0),
+                "-mm" => {
+                    let at = |i: usize| values.get(i).copied().unwrap_or(WHOLE_RANGE[i]);
+                    map.range = [0, 1].map(at);
+                }
                 _ => {}
             }
             rest = after;
         }
         map.file = with_slashes(rest);
         (!map.file.is_empty()).then_some(map)
+    }
+
+    /// Applies base and gain to the values as they are stored; the alpha channel keeps its values.
+    fn change_range(&self, image: &mut RgbaImage) {
+        if self.range == WHOLE_RANGE {
+            return;
+        }
+        let [base, gain] = self.range;
+        // A conversion to u8 clamps.
+        let changed = |value: u8| (255.0 * base + gain * f32::from(value) + 0.5) as u8;
+        let table: [u8; 256] = std::array::from_fn(|value| changed(value as u8));
+        for image::Rgba([r, g, b, _]) in image.pixels_mut() {
+            [r, g, b].into_iter().for_each(|value| *value = table[usize::from(*value)]);
+        }
     }
 }
 

@@ -7,7 +7,7 @@
 //!
 //! Faces are visible from both sides. Materials are diffuse unless they have one of the PBR keys `Pr`,
 //! `Pm`, `map_Pr` or `map_Pm`. `norm` is a tangent-space normal map as in glTF; height maps (`bump`,
-//! `map_bump`) are ignored with a note. Where common programs deviate from the format, this reader follows them: a
+//! `map_bump`) and turbulence (`-t`) are ignored with a note. Where common programs deviate from the format, this reader follows them: a
 //! map whose factor is 0 is shown, `d` takes precedence over `Tr`, and a `Tr` that would hide a material is ignored.
 //!
 //! Vertex colours (`v x y z r g b`) are sRGB, from 0 to 1, or from 0 to 255 if any value is at least 2. They

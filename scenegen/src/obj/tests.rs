@@ -105,6 +105,11 @@ fn texture_options_are_separated_from_the_name() {
     assert_eq!(map.file, "my file.png");
     assert_eq!((map.offset, map.scale), (Vec2::new(0.5, 0.25), Vec2::new(2.0, 3.0)));
     assert!(map.clamp);
+    assert!(map.range == [0.0, 1.0] && !map.is_turbulent);
+    let map = read("-mm 0.2 0.5 -t 0 0 0.1 a.png").expect("map");
+    assert!(map.range == [0.2, 0.5] && map.is_turbulent && map.file == "a.png");
+    let map = read("-t 0 0 0 -mm 0.25 a.png").expect("map");
+    assert!(map.range == [0.25, 1.0] && !map.is_turbulent);
     assert!(read("-s 1 1 1").is_none());
     assert!(read("").is_none());
 }
@@ -232,6 +237,54 @@ fn opacity_follows_the_conventions_of_exporters() {
     };
     assert!((alpha("newmtl m\nmap_Kd t.png\nmap_d t.png\n") - 0.2).abs() < 1e-6);
     assert!((alpha("newmtl m\nmap_d a.png\n") - 0.8).abs() < 1e-6);
+}
+
+/// The stored values are changed, before they are decoded as sRGB; values outside of 0 to 1 are clamped.
+#[test]
+fn base_and_gain_of_a_map_are_applied() {
+    let shown = |options: &str| {
+        let library = format!("newmtl m\nKd 1 1 1\nmap_Kd {options}t.png\nmap_Ke t.png\n");
+        let model = painted("", &library);
+        let texel = |texture: Option<TextureRef>| {
+            let texture = texture.expect("a texture");
+            let image = &model.textures[texture.texture as usize];
+            image.sample(Vec2::splat(0.5), &texture.sampler, 0.0)
+        };
+        let material = &model.materials[0];
+        assert!(model.notes.is_empty(), "{:?}", model.notes);
+        // Another use of the image has its own range; both uses keep the alpha channel.
+        let (base, emissive) = (texel(material.base_texture), texel(material.emissive_texture));
+        assert!((emissive.x - linear_from_srgb(128.0 / 255.0) as f32).abs() < 1e-6);
+        assert!((base.w - 0.2).abs() < 1e-6 && (emissive.w - 0.2).abs() < 1e-6);
+        base.x
+    };
+    // 128 of 255 becomes 51 + 64, 51 + 128, and more than 255 or less than 0.
+    for (options, value) in [
+        ("", 128.0),
+        ("-mm 0 1 ", 128.0),
+        ("-mm 0.2 0.5 ", 115.0),
+        ("-mm 0.2 ", 179.0),
+        ("-mm 0.9 1 ", 255.0),
+        ("-mm 0.2 -1 ", 0.0),
+    ] {
+        let expected = linear_from_srgb(value / 255.0) as f32;
+        assert!((shown(options) - expected).abs() < 1e-6, "{options}: {}", shown(options));
+    }
+}
+
+#[test]
+fn options_without_effect_are_noted() {
+    for (library, words) in [
+        ("map_Kd -t 0 0 0 t.png\n", &[][..]),
+        ("map_Kd -t 0.1 0 0 t.png\n", &["material m", "-t of map_kd"]),
+        ("map_Ke -t 1 t.png\n", &["material m", "-t of map_ke"]),
+        ("map_Kd t.png\nmap_d -mm 0.5 t.png\n", &["material m", "-mm of map_d"]),
+        ("map_Kd t.png\nmap_d -mm 0.5 a.png\n", &[]),
+    ] {
+        let notes = painted("", &format!("newmtl m\n{library}")).notes;
+        assert_eq!(notes.len(), usize::from(!words.is_empty()), "{library}: {notes:?}");
+        assert!(words.iter().all(|word| notes[0].contains(word)), "{library}: {notes:?}");
+    }
 }
 
 #[test]

@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 
 use glam::{DMat3, DMat4, DQuat, DVec3};
 use serde::Deserialize;
+use serde::de::IgnoredAny;
 
 use super::{CameraPath, Keyframe};
 use crate::camera::Camera;
@@ -50,6 +51,8 @@ pub struct SavedCameraPath {
     pub fps: Option<u32>,
     /// Width and height of a frame `[px]`, if given.
     pub size: Option<(u32, u32)>,
+    /// A note on what the file states and is ignored.
+    pub note: Option<&'static str>,
 }
 
 impl SavedCameraPath {
@@ -71,6 +74,7 @@ struct SavedFile {
     fps: Option<f64>,
     render_width: Option<f64>,
     render_height: Option<f64>,
+    crop: Option<IgnoredAny>,
 }
 
 #[derive(Deserialize)]
@@ -124,7 +128,8 @@ pub(super) fn parse(text: &str) -> Result<SavedCameraPath, String> {
         .zip(side("render_height", saved.render_height)?)
         .map(|(width, height)| (width.ceil() as u32, height.ceil() as u32));
     let fps = saved.fps.map(|fps| fps.round().max(1.0) as u32);
-    Ok(SavedCameraPath { path, frames: frames as u32, fps, size })
+    let note = saved.crop.map(|_| "its crop is ignored: the whole model is shown");
+    Ok(SavedCameraPath { path, frames: frames as u32, fps, size, note })
 }
 
 /// Parses a keyframe. `numbers` is camera_to_world, 4×4 and row-major, with axes right, up and backward; `fov` is the

@@ -149,8 +149,14 @@ fn nerfstudio_files_are_read() {
     let text = r#"{"camera_type": "perspective", "render_height": 4, "fps": 24, "is_cycle": true,
         "seconds": null, "camera_path": [{"fov": 90.0, "aspect": 1.5,
         "camera_to_world": [1, 0, 0, 7, 0, 0, -1, 8, 0, 1, 0, 9, 0, 0, 0, 1]}]}"#;
-    let SavedCameraPath { path, frames, fps, size } = parse(text).unwrap();
-    assert_eq!((path.is_loop, frames, fps, size), (true, 1, Some(24), None));
+    let SavedCameraPath { path, frames, fps, size, note } = parse(text).unwrap();
+    assert_eq!((path.is_loop, frames, fps, size, note), (true, 1, Some(24), None, None));
+    // The viewer writes null unless the crop box is on.
+    for (crop, is_noted) in [("null", false), (r#"{"crop_scale": [1, 1, 1]}"#, true)] {
+        let text = text.replacen('{', &format!("{{\"crop\": {crop}, "), 1);
+        let note = parse(&text).unwrap().note;
+        assert_eq!(note.is_some_and(|note| note.contains("crop")), is_noted, "{crop}");
+    }
     // The number of frames is the duration times the frame rate.
     let timed = text.replace(r#""seconds": null"#, r#""seconds": 2.02, "render_width": 6.0"#);
     let SavedCameraPath { frames, size, .. } = parse(&timed).unwrap();

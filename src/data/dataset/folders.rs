@@ -8,14 +8,11 @@ use unicode_normalization::UnicodeNormalization;
 
 use super::LoadError;
 use super::mask_files;
-use super::paths::{DataPath, Root, is_absolute, relative};
+use super::paths::{DataPath, PHOTOGRAPHS, Root, is_absolute, namesake, relative};
 use super::{Frame, LoadOptions, Resolution};
 
 /// Extensions that are tried for names without one, as in NeRF-synthetic files.
 const EXTENSIONS: [&str; 8] = ["", ".png", ".jpg", ".jpeg", ".webp", ".PNG", ".JPG", ".JPEG"];
-
-/// Extensions of photographs that COLMAP reads.
-const PHOTOGRAPHS: [&str; 7] = ["jpg", "jpeg", "png", "webp", "tif", "tiff", "bmp"];
 
 /// The folders of one dataset.
 #[derive(Debug)]
@@ -140,7 +137,8 @@ impl Folders {
     }
 
     pub(super) fn missing(&self, named: DataPath<'_>) -> LoadError {
-        LoadError::missing_image(named.file, named.field, &self.shown_path(named))
+        let image = self.shown_path(named);
+        LoadError::missing_image(named.file, named.field, &image, namesake(&image).as_deref())
     }
 
     /// The path that messages name for a missing image: the first one tried, or the bare file name in `--images` if

@@ -3,6 +3,8 @@
 //! COLMAP's and nerfstudio's masks are in `masks/` and folders with similar names; RealityCapture's mask layers,
 //! 3DGRUT's masks and instant-ngp's dynamic masks are beside the photographs.
 
+use std::cell::OnceCell;
+use std::collections::HashSet;
 use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
 
@@ -32,6 +34,46 @@ impl MaskFile {
     /// A mask whose black pixels hide those of the photograph.
     pub(super) fn black_hides(path: PathBuf) -> Self {
         Self { path, hides_all_but_black: false }
+    }
+}
+
+/// The photographs that a pose file lists, none of which is the mask of another.
+pub(super) struct Listed<'a> {
+    /// Folders in which they are looked for.
+    folders: &'a [&'a Folders],
+    file: &'a Path,
+    names: Vec<&'a str>,
+    /// Their files, which are looked for only if there may be a mask.
+    files: OnceCell<HashSet<PathBuf>>,
+}
+
+impl<'a> Listed<'a> {
+    pub(super) fn new(
+        folders: &'a [&'a Folders],
+        file: &'a Path,
+        names: impl Iterator<Item = &'a str>,
+    ) -> Self {
+        Self { folders, file, names: names.collect(), files: OnceCell::new() }
+    }
+
+    fn contains(&self, path: &Path) -> bool {
+        let files = self.files.get_or_init(|| {
+            let each = self.folders.iter().flat_map(|folders| {
+                let named =
+                    |value: &&'a str| DataPath { file: self.file, field: "the list", value };
+                // A path that is refused is reported where its photograph is read.
+                let images = self
+                    .names
+                    .iter()
+                    .filter_map(move |value| folders.image(named(value)).ok().flatten());
+                images.flat_map(|image| {
+                    let (root, places) = folders.image_places(&image);
+                    places.into_iter().map(|place| root.path().join(place))
+                })
+            });
+            each.filter_map(|path| path.canonicalize().ok()).collect()
+        });
+        path.canonicalize().is_ok_and(|path| files.contains(&path))
     }
 }
 
@@ -83,8 +125,12 @@ impl Folders {
         &self,
         image: &ImageFile,
         named: DataPath<'_>,
+        listed: &Listed<'_>,
     ) -> Result<Option<MaskFile>, LoadError> {
-        let at = |root: &Root, value: String| root.existing(DataPath { value: &value, ..named });
+        let at = |root: &Root, value: String| {
+            let found = root.existing(DataPath { value: &value, ..named })?;
+            Ok::<_, LoadError>(found.filter(|path| !listed.contains(path)))
+        };
         // The file's name has an extension, which the listed name may lack.
         let listed = self.inside_images(&image.name);
         let file = image.path.file_name().and_then(OsStr::to_str).unwrap_or_default();

@@ -210,7 +210,9 @@ impl Dataset {
         if scene.frames.is_empty() {
             let listing = scene.listing.display();
             let first = scene.first_missing.map_or_else(String::new, |path| {
-                format!("; the first one looked for is {}", path.display())
+                let other = paths::namesake(&path);
+                let other = other.map_or_else(String::new, |other| format!(" ({other} exists)"));
+                format!("; the first one looked for is {}{other}", path.display())
             });
             let problem = format!("{listing} lists no image that exists{first}");
             return Err(LoadError::Remedied { problem, remedy: LoadRemedy::AddOrImagesFolder });

@@ -11,6 +11,8 @@ use crate::error::{LoadError, LoadRemedy};
 
 /// Path separators of all systems, as paths may come from another system.
 const SEPARATORS: [char; 2] = ['/', '\\'];
+/// Extensions of photographs that COLMAP reads.
+pub(super) const PHOTOGRAPHS: [&str; 7] = ["jpg", "jpeg", "png", "webp", "tif", "tiff", "bmp"];
 /// Longest name accepted from a data file `[bytes]`.
 pub(super) const MAX_NAME: usize = 4096;
 
@@ -121,6 +123,13 @@ fn other_case(path: &Path) -> Option<PathBuf> {
     let ending = path.extension()?.to_str()?;
     let cases = [ending.to_ascii_lowercase(), ending.to_ascii_uppercase()];
     cases.iter().map(|ending| path.with_extension(ending)).find(|path| path.exists())
+}
+
+/// The name of a photograph beside `path` that differs from it only by its extension.
+pub(super) fn namesake(path: &Path) -> Option<String> {
+    let both = PHOTOGRAPHS.iter().flat_map(|ending| [(*ending).to_owned(), ending.to_uppercase()]);
+    let other = both.map(|ending| path.with_extension(ending)).find(|other| other.is_file())?;
+    Some(other.file_name()?.to_string_lossy().into_owned())
 }
 
 fn names(folder: &Path) -> Names {

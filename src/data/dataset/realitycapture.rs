@@ -22,7 +22,8 @@ use super::formats::DatasetFormat;
 use super::images::{self, ImageHeader};
 use super::lens::models::Term;
 use super::lens::{Distortion, Lens, Projection};
-use super::paths::{DataPath, Root, relative};
+use super::mask_files::Listed;
+use super::paths::{DataPath, Root, namesake, relative};
 use super::pose::{check_lens, checked_pose};
 use super::prepare::text_notes;
 use super::transforms::usual_points;
@@ -103,14 +104,18 @@ fn read(root: &Root, options: &LoadOptions) -> Result<Option<Scene>, LoadError> 
     let Some(columns) = lines.find_map(|(_, line)| Columns::parse(line)) else {
         return fault("the first line", "it does not name the columns");
     };
+    let row = |(number, line)| Row { path, number, columns: &columns, cells: cells(line) };
+    let rows: Vec<Row<'_>> = lines.map(row).take(MAX_FRAMES + 1).collect();
+    let places = [&in_images, &in_root];
+    let names = rows.iter().map(|row| row.text("name").trim());
+    let photographs = Listed::new(&places, path, names);
     let (mut frames, mut missing, mut fell_back, mut first_missing) =
         (Vec::new(), Vec::new(), 0, None);
-    for (number, line) in lines {
+    for row in &rows {
         if frames.len() + missing.len() == MAX_FRAMES {
             return fault("the file", "it lists more than a million photographs");
         }
-        let row = Row { path, number, columns: &columns, cells: cells(line) };
-        let name = row.text("name").trim();
+        let (number, name) = (row.number, row.text("name").trim());
         let field = format!("line {number}: name");
         let named = DataPath { file: path, field: &field, value: name };
         let (folders, found) = match in_images.image(named)? {
@@ -128,7 +133,7 @@ fn read(root: &Root, options: &LoadOptions) -> Result<Option<Scene>, LoadError> 
         let origin = format!("line {number} ({name})");
         let (rotation, translation) = row.pose(&origin)?;
         let (lens, header) = row.lens(&origin, &found.path, found.reduced)?;
-        let mask = folders.mask(&found, named)?;
+        let mask = folders.mask(&found, named, &photographs)?;
         frames.push(Frame {
             name: found.name,
             id: None,
@@ -153,8 +158,10 @@ fn read(root: &Root, options: &LoadOptions) -> Result<Option<Scene>, LoadError> 
     if let Some(first) = missing.first() {
         let (missing, all) = (missing.len(), missing.len() + frames.len());
         let file = path.file_name().unwrap_or_default().display();
+        let other = first_missing.as_deref().and_then(namesake);
+        let other = other.map_or_else(String::new, |other| format!("; {other} exists"));
         notes.push(format!(
-            "{file}: {missing} of {all} photographs do not exist and are skipped (first: {first})"
+            "{file}: {missing} of {all} photographs do not exist and are skipped (first: {first}{other})"
         ));
     }
     if fell_back > 0 {

@@ -14,6 +14,7 @@ mod spz;
 
 mod changes;
 mod coordinates;
+mod lists;
 mod quantise;
 mod recognise;
 mod rows;
@@ -37,7 +38,7 @@ pub use coordinates::{
     Coarseness, Coordinates, Frame, is_finer_than_f32, local_origin, offset_text, round_origin,
 };
 pub(crate) use ply::layout::OFFSET as PLY_OFFSET;
-pub use recognise::{Match, ModelFile, Reader, main_file, read_model};
+pub use recognise::{Match, ModelFile, Reader, is_model_folder, main_file, read_model};
 pub use rows::SplatFile;
 pub use sidecar::{remove_sidecar, sidecar_path, write_sidecar};
 pub(crate) use sog::folder_in_archive;

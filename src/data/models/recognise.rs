@@ -8,7 +8,7 @@ use std::fs::File;
 use std::io::{BufReader, Read, Seek};
 use std::path::{Path, PathBuf};
 
-use super::{Format, SplatFile, formats, names, sidecar};
+use super::{Format, SplatFile, formats, lists, names, sidecar};
 use crate::error::LoadError;
 use densify_core::files;
 
@@ -107,10 +107,14 @@ impl<'a> ModelFile<'a> {
 /// not finite.
 pub fn read_model(path: &Path) -> Result<SplatFile, LoadError> {
     if path.is_dir() {
-        let main = main_file(path).ok_or_else(|| no_main_file(path))?;
+        let list = Some(path.join(lists::STREAMED)).filter(|list| list.is_file());
+        let main = main_file(path).or(list).ok_or_else(|| no_main_file(path))?;
         return read_model(&main);
     }
     let file = ModelFile::open(path)?;
+    if let Some(error) = file.json()?.and_then(|text| lists::refusal(path, text)) {
+        return Err(error);
+    }
     let mut best = None;
     for (_, reader) in readers() {
         match (reader.recognise)(&file)? {
@@ -124,12 +128,6 @@ pub fn read_model(path: &Path) -> Result<SplatFile, LoadError> {
     }
     let mut model = match best {
         Some(reader) => (reader.read)(file)?,
-        None if file.json()?.is_some_and(|text| text.contains("\"lodLevels\"")) => {
-            return Err(LoadError::Data(format!(
-                "{} is a list of models in several levels of detail; name one of the meta.json files that it lists",
-                path.display()
-            )));
-        }
         None => return Err(unrecognised(path)),
     };
     sidecar::apply(path, &mut model)?;
@@ -140,6 +138,11 @@ pub fn read_model(path: &Path) -> Result<SplatFile, LoadError> {
 pub fn main_file(folder: &Path) -> Option<PathBuf> {
     let names = readers().into_iter().filter_map(|(_, reader)| reader.main_file);
     names.map(|name| folder.join(name)).find(|path| path.is_file())
+}
+
+/// Returns true if a folder is a model, or a list of models, which [`read_model`] refuses with the reason.
+pub fn is_model_folder(folder: &Path) -> bool {
+    main_file(folder).is_some() || folder.join(lists::STREAMED).is_file()
 }
 
 fn readers() -> Vec<(&'static Format, Reader)> {

@@ -155,6 +155,8 @@ pub enum FilmError {
 pub struct Film {
     /// Number of frames.
     pub frames: u32,
+    /// A note on what the file of the camera path states and is ignored.
+    pub note: Option<&'static str>,
 }
 
 /// A video that is being made.
@@ -206,7 +208,8 @@ impl Film {
     ) -> Result<Self, FilmError> {
         let FilmSource { mut backend, sh_degree, background, normalisation, cameras } = source;
         let first = cameras.first().map(|first| (first.width, first.height));
-        let generated = |path| SavedCameraPath { path, frames: FRAMES, fps: None, size: None };
+        let generated =
+            |path| SavedCameraPath { path, frames: FRAMES, fps: None, size: None, note: None };
         let (saved, in_world) = match route {
             CameraRoute::Orbit => (generated(camera_path::orbit(&cameras)), false),
             CameraRoute::Spiral => (generated(camera_path::spiral(&cameras)), false),
@@ -237,7 +240,7 @@ impl Film {
             Some(Video::WebP(path, animation)) => animation.write(path)?,
             Some(Video::Mp4(path)) => encode(folder, path, frames, fps)?,
         }
-        Ok(Self { frames })
+        Ok(Self { frames, note: saved.note })
     }
 }
 

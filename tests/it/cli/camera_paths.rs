@@ -103,16 +103,16 @@ fn a_camera_path_in_a_file_is_in_the_datasets_coordinates() {
     assert!(most.is_some_and(|most| most <= 4), "{most:?}");
     // Duration and size come from the file.
     let lasting = serde_json::json!({ "camera_path": [key], "seconds": 0.5, "fps": 8, "render_width": 18,
-        "render_height": 10 });
+        "render_height": 10, "crop": { "crop_center": [0, 0, 0], "crop_scale": [1, 1, 1] } });
     std::fs::write(&path, lasting.to_string()).unwrap();
     let video = root.path().join("film.webp");
-    call(&format!(
+    let lasting = call(&format!(
         "render {run_text} -o {} --path {} --video {}",
         text(&root.path().join("lasting")),
         text(&path),
         text(&video)
-    ))
-    .ok();
+    ));
+    assert!(lasting.ok().stdout.contains("path.json: its crop is ignored"));
     assert_eq!(size(&root.path().join("lasting"), "frame_00003.png"), (18, 10));
     let bytes = std::fs::read(&video).expect("a video");
     let decoder = WebPDecoder::new(std::io::Cursor::new(bytes)).expect("it is WebP");

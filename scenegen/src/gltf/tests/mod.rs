@@ -159,6 +159,29 @@ fn quantised_positions_are_read() {
     assert_eq!(area(&load_bytes(&glb(&json, &bin)).expect("square")), DVec3::Z);
 }
 
+/// Colours are floats or normalised integers; the range of other integers is not defined.
+#[test]
+fn colours_in_plain_integers_are_refused() {
+    let load = |normalized: bool| {
+        let (mut json, mut bin) = square();
+        json["bufferViews"]
+            .as_array_mut()
+            .expect("views")
+            .push(json!({ "buffer": 0, "byteOffset": bin.len(), "byteLength": 16 }));
+        bin.extend([0, 255, 51, 255].repeat(4));
+        json["buffers"][0]["byteLength"] = json!(bin.len());
+        json["accessors"].as_array_mut().expect("accessors").push(json!(
+            { "bufferView": 2, "componentType": 5121, "normalized": normalized, "count": 4, "type": "VEC4" }
+        ));
+        json["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"] = json!(2);
+        load_bytes(&glb(&json, &bin))
+    };
+    let colours = load(true).expect("a square").colours;
+    assert!((colours[3] - glam::Vec4::new(0.0, 1.0, 0.2, 1.0)).abs().max_element() < 1e-6);
+    let message = load(false).expect_err("bytes").to_string();
+    assert!(message.contains("primitive 0 COLOR_0") && message.contains("normalized"), "{message}");
+}
+
 #[test]
 fn bad_values_are_errors_that_name_the_element() {
     let big = 1_u64 << 60;

@@ -16,6 +16,7 @@ use glam::{DMat3, DVec3};
 use super::folders::Folders;
 use super::formats::DatasetFormat;
 use super::lens::Lens;
+use super::mask_files::Listed;
 use super::paths::{DataPath, Root, relative};
 use super::pose::{checked_pose, checked_quaternion};
 use super::prepare::text_notes;
@@ -182,6 +183,9 @@ fn read(root: &Root, options: &LoadOptions) -> Result<Option<Scene>, LoadError> 
     let Some(chosen) = choose_model(root, options.sparse.as_deref())? else { return Ok(None) };
     let folders = Folders::new(root, options, true)?;
     let ([cameras, images, points], model) = model(&chosen, options.tracks)?;
+    let names: Vec<String> = model.images.iter().map(|image| image.name.clone()).collect();
+    let places = [&folders];
+    let photographs = Listed::new(&places, &images, names.iter().map(String::as_str));
     let mut frames = Vec::with_capacity(model.images.len());
     let mut reduced_missing = 0;
     for image in model.images {
@@ -193,7 +197,7 @@ fn read(root: &Root, options: &LoadOptions) -> Result<Option<Scene>, LoadError> 
         let named = DataPath { file: &images, field: &field, value: &image.name };
         let found = folders.image(named)?.ok_or_else(|| folders.missing(named))?;
         reduced_missing += usize::from(found.fell_back);
-        let mask = folders.mask(&found, named)?;
+        let mask = folders.mask(&found, named, &photographs)?;
         frames.push(Frame {
             name: found.name,
             id: Some(image.id),

@@ -22,6 +22,7 @@ const CAMERAS: &[Replacement] = &[
     ),
     ("PINHOLE", "MAGIC", "MAGIC, image_undistorter"),
     ("PINHOLE 20 12 15 16 10 6", "EQUIRECTANGULAR 20 10 20 10", "EQUIRECTANGULAR, faces of a cube"),
+    ("PINHOLE 20 12 15 16 10 6", "SPHERICAL 20 10 20 10", "model SPHERICAL is, faces of a cube"),
     ("PINHOLE 20 12 15 16 10 6", "EUCM 20 12 15 16 10 6 0 1", "EUCM, image_undistorter"),
     (" 10 6\n", " 10\n", "cameras.txt, line 2: camera 1: PINHOLE has 4 parameters, not 3"),
     (" 10 6\n", " 10 6 1\n", "cameras.txt, camera 1: PINHOLE has 4 parameters, not 5"),
@@ -88,7 +89,12 @@ fn faults_of_colmap_text_files_are_named() {
             (
                 "no image",
                 |m| m.remove("images/b.png"),
-                "images.txt, image b.png, images/b.png, RestoreOrImagesFolder",
+                "images.txt, image b.png, images/b.png does not exist\", RestoreOrImagesFolder",
+            ),
+            (
+                "another extension",
+                |m| std::fs::rename(m.file("images/b.png"), m.file("images/b.jpg")).unwrap(),
+                "images.txt, image b.png, images/b.png does not exist, but b.jpg does",
             ),
             (
                 "other size",

@@ -46,6 +46,42 @@ fn masks_are_found_under_all_usual_names() {
     }
 }
 
+/// Photographs may have names like those of masks of others.
+#[test]
+fn listed_photographs_are_no_masks() {
+    let name = "a_mask.png";
+    let transforms = Made::transforms(|json| {
+        json["frames"][1]["file_path"] = format!("images/{name}").into();
+    });
+    let (colmap, table) = (Made::colmap_txt(), Made::realitycapture());
+    colmap.replace("sparse/0/images.txt", "b.png", name);
+    table.replace("cameras.csv", "b.png", name);
+    for made in [transforms, colmap, table] {
+        let photograph = made.file(&format!("images/{name}"));
+        std::fs::rename(made.file("images/b.png"), &photograph).unwrap();
+        let options = LoadOptions { images: Some("./images".into()), ..LoadOptions::default() };
+        for options in [LoadOptions::default(), options] {
+            let data = load_with(&made, &options);
+            assert!(
+                data.train.iter().all(|view| view.source.mask.is_none()) && data.train.len() == 3
+            );
+        }
+        // The next of the usual names counts.
+        image(&made.file("images/dynamic_mask_a.png"), SIZE, 200);
+        let mask = load(&made).train[0].source.mask.clone().expect("a mask");
+        assert!(mask.file.path.ends_with("dynamic_mask_a.png"), "{}", mask.file.path.display());
+    }
+    // With reduced photographs, the full-size ones are no masks either.
+    let made = Made::colmap_txt();
+    made.replace("sparse/0/images.txt", "b.png", name);
+    std::fs::rename(made.file("images/b.png"), made.file("images/a_mask.png")).unwrap();
+    for name in ["a.png", name, "c.png"] {
+        image(&made.file("images_2").join(name), (10, 6), 7);
+    }
+    let half = LoadOptions { resolution: Some(Resolution::Divisor(2)), ..LoadOptions::default() };
+    assert!(load_with(&made, &half).train.iter().all(|view| view.source.mask.is_none()));
+}
+
 #[test]
 fn folders_whose_masks_belong_to_no_photograph_are_noted() {
     for file in ["masks/other.png", "images/masks/b.png", "Segmentation/other.png"] {

@@ -189,6 +189,16 @@ fn damaged_tables_are_refused_by_line_and_column() {
                 |m| std::fs::remove_dir_all(m.file("images")).unwrap(),
                 "cameras.csv, no image, a.png, AddOrImagesFolder",
             ),
+            (
+                "other photographs",
+                |m| {
+                    for name in ["a", "b", "c"] {
+                        let image = m.file(&format!("images/{name}.png"));
+                        std::fs::rename(&image, image.with_extension("webp")).unwrap();
+                    }
+                },
+                "cameras.csv, no image, a.png (a.webp exists)",
+            ),
             ("not an image", |m| m.write("images/b.png", "hello"), "images/b.png, decode"),
             (
                 "a far-off camera",

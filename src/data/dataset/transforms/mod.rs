@@ -21,7 +21,8 @@ use super::folders::Folders;
 use super::formats::DatasetFormat;
 use super::frame_lists::FrameLists;
 use super::json;
-use super::paths::{DataPath, Root, relative};
+use super::mask_files::Listed;
+use super::paths::{DataPath, Root, namesake, relative};
 use super::prepare::text_notes;
 use super::{Frame, LoadError, LoadOptions, Note, Scene, Split, colmap};
 use fields::Fields;
@@ -108,6 +109,9 @@ fn read(
     if declared == DeclaredSplit::InLists {
         top.frame_lists(folders, &mut lists)?;
     }
+    let names = listed.iter().filter_map(|(fields, _)| fields.text("file_path").ok().flatten());
+    let places = [folders];
+    let photographs = Listed::new(&places, &path, names);
     let (mut frames, mut missing, mut fell_back) = (Vec::new(), Vec::new(), 0);
     let (mut first_missing, mut bad) = (None, Vec::new());
     for (fields, split) in &listed {
@@ -135,8 +139,8 @@ fn read(
         fell_back += usize::from(found.fell_back);
         let (rotation, translation) = fields.pose(file)?;
         let mask = match fields.text("mask_path")? {
-            Some(value) => Some(fields.mask(root, folders, &found, value)?),
-            None => folders.mask(&found, named)?,
+            Some(value) => Some(fields.mask((root, folders, &photographs), &found, value)?),
+            None => folders.mask(&found, named, &photographs)?,
         };
         let (lens, header) = fields.lens(&found.path, found.reduced)?;
         let frame = Frame {
@@ -170,7 +174,14 @@ fn read(
     notes.extend(top.notes(&listed)?);
     if let Some(first) = missing.first() {
         let count = missing.len();
-        notes.push(format!("{name}: {count} of {} frames have no image file and are skipped ({first} is the first)", listed.len()));
+        let other = first_missing
+            .as_deref()
+            .and_then(namesake)
+            .map_or_else(String::new, |other| format!("; {other} exists"));
+        notes.push(format!(
+            "{name}: {count} of {} frames have no image file and are skipped ({first} is the first{other})",
+            listed.len()
+        ));
     }
     if let Some(first) = bad.first() {
         let (count, all) = (bad.len(), listed.len());

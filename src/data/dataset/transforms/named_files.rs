@@ -5,8 +5,8 @@ use std::path::{Path, PathBuf};
 
 use super::super::LoadError;
 use super::super::folders::{Folders, ImageFile};
-use super::super::mask_files::MaskFile;
-use super::super::paths::{DataPath, Root, relative};
+use super::super::mask_files::{Listed, MaskFile};
+use super::super::paths::{DataPath, Root, namesake, relative};
 use super::DeclaredSplit;
 use super::fields::Fields;
 use densify_core::files;
@@ -79,8 +79,7 @@ impl Fields<'_> {
     /// The mask that a frame names.
     pub(super) fn mask(
         &self,
-        root: &Root,
-        folders: &Folders,
+        (root, folders, listed): (&Root, &Folders, &Listed<'_>),
         image: &ImageFile,
         value: &str,
     ) -> Result<MaskFile, LoadError> {
@@ -89,7 +88,7 @@ impl Fields<'_> {
         if folders.folder_for_absolute(value).is_none() {
             let missing = || {
                 let place = root.path().join(relative(value));
-                LoadError::missing_image(self.path, &field, &place)
+                LoadError::missing_image(self.path, &field, &place, namesake(&place).as_deref())
             };
             return Ok(MaskFile::black_hides(
                 root.existing_on_any_system(named)?.ok_or_else(missing)?,
@@ -102,7 +101,7 @@ impl Fields<'_> {
                 return Ok(MaskFile::black_hides(found));
             }
         }
-        folders.mask(image, named)?.ok_or_else(|| {
+        folders.mask(image, named, listed)?.ok_or_else(|| {
             let problem = format!("the mask {value:?} is not in the dataset's folder");
             let remedy =
                 "put it into `masks/` there, under the photograph's name, or remove the field";

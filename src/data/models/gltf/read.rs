@@ -5,6 +5,7 @@ use std::io::Read;
 use std::path::Path;
 
 use serde::Deserialize;
+use serde::de::IgnoredAny;
 use serde_json::Value;
 
 use super::accessors::{Accessor, Buffers, View};
@@ -17,17 +18,25 @@ use crate::models::rows::{Row, Rows, SplatFile};
 use crate::models::statement::stated_in_json;
 use crate::models::unpack::read_exactly;
 use crate::models::{siblings, spz};
-use densify_core::files::max_unpacked_bytes;
+use densify_core::files::{max_unpacked_bytes, one_line};
 use densify_core::gaussians::{MAX_SH_DEGREE, sh_coefficients, sigmoid};
 
 /// The extension for splats in SPZ.
 pub(super) const SPZ: &str = "KHR_gaussian_splatting_compression_spz_2";
-/// Extensions that a file may require: the extensions of splats, and extensions without effect on splats.
-const KNOWN: [&str; 4] = [SPLATS, SPZ, "KHR_materials_unlit", "KHR_mesh_quantization"];
+/// Extensions that a file may require: those that are applied to splats, and those without effect on them.
+const KNOWN: [&str; 5] =
+    [SPLATS, SPZ, nodes::VISIBILITY, "KHR_materials_unlit", "KHR_mesh_quantization"];
 
 /// The values that are read of properties of [`SPLATS`]; the names with a dot are those of drafts.
-const READ: [(&str, &[&str]); 2] =
-    [("kernel", &["ellipse"]), ("colorSpace", &["srgb_rec709_display", "BT.709-sRGB", "BT.709"])];
+const READ: [(&str, &[&str]); 3] = [
+    ("kernel", &["ellipse"]),
+    ("colorSpace", &["srgb_rec709_display", "BT.709-sRGB", "BT.709"]),
+    ("projection", &["perspective"]),
+];
+
+/// The only value of `sortingMethod` in [`SPLATS`], and the default. Splats are sorted by their depth, as in the
+/// original renderer, which differs little.
+const SORTED: &str = "cameraDistance";
 
 /// Largest accepted opacity: 1 plus rounding errors.
 const MAX_OPACITY: f32 = 1.001;
@@ -37,13 +46,15 @@ const MAX_OPACITY: f32 = 1.001;
 #[serde(rename_all = "camelCase", default)]
 struct Document {
     extensions_required: Vec<String>,
+    extensions_used: Vec<String>,
+    animations: Vec<IgnoredAny>,
     buffers: Vec<BufferSource>,
     buffer_views: Vec<View>,
     accessors: Vec<Accessor>,
     meshes: Vec<Mesh>,
     nodes: Vec<nodes::Node>,
     scenes: Vec<Scene>,
-    scene: usize,
+    scene: Option<usize>,
     /// Data of the program that wrote the file; densify states the antialiasing there.
     extras: Value,
 }
@@ -142,14 +153,23 @@ fn read(
         views: &document.buffer_views,
         buffers: contents,
     };
-    let mut whole = SplatFile::default();
-    let mut primitives = 0;
-    let roots = document.scenes.get(document.scene).map(|scene| scene.nodes.as_slice());
-    for (mesh, transform) in nodes::placed_meshes(path, &document.nodes, roots)? {
+    let mut whole = SplatFile { notes: notes(&document), ..SplatFile::default() };
+    let (mut primitives, mut is_any_hidden) = (0, false);
+    let scene = document.scenes.get(document.scene.unwrap_or(0));
+    if let (None, Some(number)) = (scene, document.scene) {
+        return Err(LoadError::damaged(path, "scene", format!("there is no scene {number}")));
+    }
+    let roots = scene.map(|scene| scene.nodes.as_slice());
+    for placed in nodes::placed_meshes(path, &document.nodes, roots)? {
         let no_mesh = || LoadError::damaged(path, "nodes", "there is no such mesh");
-        for primitive in &document.meshes.get(mesh).ok_or_else(no_mesh)?.primitives {
+        for primitive in &document.meshes.get(placed.mesh).ok_or_else(no_mesh)?.primitives {
             let Some(extension) = primitive.extensions.get(SPLATS) else { continue };
+            if placed.is_hidden {
+                is_any_hidden = true;
+                continue;
+            }
             primitives += 1;
+            let transform = placed.transform(path)?;
             let mut part = splats(&buffers, primitive, extension)?;
             transform.apply(&mut part.gaussians);
             join(path, &mut whole, part)?;
@@ -162,16 +182,43 @@ fn read(
             }
         }
     }
+    if primitives == 0 && is_any_hidden {
+        let problem = format!("all splats are hidden ({})", nodes::VISIBILITY);
+        let remedy = "show the nodes to be read, and export the file again";
+        return Err(LoadError::malformed(path, "nodes", problem, remedy));
+    }
     if primitives == 0 {
         return Err(LoadError::Data(format!(
             "{} holds no Gaussian splats ({SPLATS}); a mesh is rendered by `densify scenegen`",
             path.display()
         )));
     }
+    if is_any_hidden {
+        whole.notes.push(format!("hidden nodes ({}) are left out", nodes::VISIBILITY));
+    }
     if let Some(stated) = stated_in_json(path, "extras", &document.extras)? {
         whole.gaussians.antialiasing = stated;
     }
     Ok(whole)
+}
+
+/// Notes on what the file has besides splats and is ignored.
+fn notes(document: &Document) -> Vec<String> {
+    let ignored = document.extensions_used.iter().filter(|name| !KNOWN.contains(&name.as_str()));
+    let names: Vec<String> = ignored.take(10).map(|name| shortened(name)).collect();
+    let mut notes = Vec::new();
+    if !names.is_empty() {
+        notes.push(format!("these extensions are ignored: {}", names.join(", ")));
+    }
+    if !document.animations.is_empty() {
+        notes.push("animations are ignored: nodes are where the file places them".to_owned());
+    }
+    notes
+}
+
+/// Text of the file, shortened for a message.
+fn shortened(text: &str) -> String {
+    one_line(&text.chars().take(60).collect::<String>())
 }
 
 /// The bytes of a buffer outside the binary chunk.
@@ -197,17 +244,23 @@ fn splats(
         if let Some(stated) = extension.get(key)
             && !stated.as_str().is_some_and(|stated| known.contains(&stated))
         {
+            let stated = shortened(&stated.to_string());
             let problem = format!("{stated} is not supported, only {}", known.join(", "));
             return Err(LoadError::damaged(path, format!("{SPLATS}: {key}"), problem));
         }
     }
+    let other_order = extension.get("sortingMethod").filter(|stated| *stated != SORTED);
+    let other_order = other_order.map(|stated| {
+        let stated = shortened(&stated.to_string());
+        format!("sortingMethod {stated} is ignored: splats are sorted by their depth")
+    });
     if let Some(view) = extension.pointer(&format!("/extensions/{SPZ}/bufferView")) {
         let view = view.as_u64().and_then(|view| usize::try_from(view).ok());
         let bytes = buffers.view(view.unwrap_or(usize::MAX))?;
         let (mut file, axes) = spz::read::read_as_stored(path, bytes, bytes.len() as u64)?;
         let ignored =
             axes.map(|axes| format!("its SPZ states the axes {axes}, which glTF overrides"));
-        file.notes.extend(ignored);
+        file.notes.extend(ignored.into_iter().chain(other_order));
         return Ok(file);
     }
     let attribute = |name: &str, width: usize| match primitive.attributes.get(name) {
@@ -226,6 +279,7 @@ fn splats(
     let has = |degree: &u8| primitive.attributes.contains_key(&coefficient(*degree, 0));
     let sh_degree = (0..=MAX_SH_DEGREE).take_while(|degree| *degree == 0 || has(degree)).last();
     let sh_degree = sh_degree.unwrap_or(0);
+    check_colours(path, primitive, sh_degree)?;
     let mut bands = Vec::new();
     for degree in 0..=sh_degree {
         for n in 0..=2 * degree {
@@ -272,6 +326,7 @@ fn splats(
         });
     }
     let mut file = rows.finish(path)?;
+    file.notes.extend(other_order);
     if log_scales.is_none() && may_be_logarithms(&file.gaussians, scales.as_chunks().0) {
         file.notes.push(
             "its scales may be logarithms, although glTF stores scales as they are: if all Gaussians are too large or too \
@@ -280,6 +335,26 @@ fn splats(
         );
     }
     Ok(file)
+}
+
+/// Refuses coefficients of spherical harmonics beyond `sh_degree`, the degree that is read.
+fn check_colours(path: &Path, primitive: &Primitive, sh_degree: u8) -> Result<(), LoadError> {
+    let start = format!("{SPLATS}:SH_DEGREE_");
+    let read: Vec<String> = (0..=sh_degree)
+        .flat_map(|degree| (0..=2 * degree).map(move |n| coefficient(degree, n)))
+        .collect();
+    let is_unread = |name: &&String| name.starts_with(&start) && !read.contains(name);
+    let Some(name) = primitive.attributes.keys().find(is_unread) else { return Ok(()) };
+    let degree = name[start.len()..].split('_').next().and_then(|text| text.parse::<u64>().ok());
+    let problem = match degree {
+        Some(degree) if degree > u64::from(MAX_SH_DEGREE) => {
+            format!("colours have degree {degree}, but densify reads 0 to {MAX_SH_DEGREE}")
+        }
+        _ => {
+            "it is no coefficient, or others of its degree or of a lower one are missing".to_owned()
+        }
+    };
+    Err(LoadError::damaged(path, shortened(name), problem))
 }
 
 /// Appends a part; the result has the higher of the two degrees.

@@ -1,4 +1,4 @@
-//! Tests of the numbers in accessors, and of numbers that cannot be scales or opacities.
+//! Tests of the numbers in accessors, of numbers that cannot be scales or opacities, and of what is refused or noted.
 
 use std::path::Path;
 
@@ -6,9 +6,10 @@ use serde_json::{Value, json};
 
 use super::accessors::{Accessor, Buffers, View};
 use super::layout::{SPLATS, coefficient};
+use super::nodes::VISIBILITY;
 use super::read::SPZ;
 use crate::models::ply::activation::may_be_logarithms;
-use crate::models::read_model;
+use crate::models::{SplatFile, read_model};
 use densify_core::gaussians::Gaussians;
 
 /// If normalised, the smallest integer is −1, as is the next larger one (glTF 2.0, section 3.11); otherwise it keeps
@@ -39,6 +40,16 @@ fn signed_integers_keep_their_minimum_unless_normalised() {
 
 /// Reads a model of one splat; `stated` are the properties of the extension.
 fn read_one(scale: [f32; 3], opacity: f32, stated: Value) -> Result<Gaussians, String> {
+    read_changed(scale, opacity, stated, |_| ()).map(|file| file.gaussians)
+}
+
+/// As [`read_one`], after a change of the document.
+fn read_changed(
+    scale: [f32; 3],
+    opacity: f32,
+    stated: Value,
+    change: impl Fn(&mut Value),
+) -> Result<SplatFile, String> {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("model.gltf");
     let (mut data, mut views, mut accessors) = (Vec::new(), Vec::new(), Vec::new());
@@ -60,12 +71,13 @@ fn read_one(scale: [f32; 3], opacity: f32, stated: Value) -> Result<Gaussians, S
     }
     std::fs::write(folder.path().join("data.bin"), &data).unwrap();
     let primitive = json!({"attributes": attributes, "extensions": {SPLATS: stated}});
-    let document = json!({
+    let mut document = json!({
         "asset": {"version": "2.0"}, "buffers": [{"uri": "data.bin", "byteLength": data.len()}],
         "bufferViews": views, "accessors": accessors, "nodes": [{"mesh": 0}], "meshes": [{"primitives": [primitive]}],
     });
+    change(&mut document);
     std::fs::write(&path, document.to_string()).unwrap();
-    read_model(&path).map(|file| file.gaussians).map_err(|error| error.to_string())
+    read_model(&path).map_err(|error| error.to_string())
 }
 
 /// Only sRGB is read; the draft of 2025 had other names than the standard.
@@ -75,7 +87,7 @@ fn other_colour_spaces_and_kernels_are_refused() {
     for stated in [
         json!({}),
         json!({"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}),
-        json!({"colorSpace": "BT.709-sRGB"}),
+        json!({"colorSpace": "BT.709-sRGB", "projection": "perspective"}),
     ] {
         assert_eq!(read(stated.clone()).map(|model| model.len()), Ok(1), "{stated}");
     }
@@ -84,6 +96,7 @@ fn other_colour_spaces_and_kernels_are_refused() {
         ("colorSpace", json!("BT.709-linear")),
         ("colorSpace", json!(1)),
         ("kernel", json!("box")),
+        ("projection", json!("orthographic")),
     ] {
         // Splats in SPZ state their colours in the same place.
         let spz = json!({SPZ: {"bufferView": 0}});
@@ -93,6 +106,108 @@ fn other_colour_spaces_and_kernels_are_refused() {
                 assert!(message.contains(word), "{message}");
             }
         }
+    }
+}
+
+/// The notes on a document of one splat after a change, or the error.
+fn notes(stated: Value, change: impl Fn(&mut Value)) -> Result<Vec<String>, String> {
+    read_changed([0.5; 3], 0.5, stated, change).map(|file| file.notes)
+}
+
+#[test]
+fn what_has_no_effect_is_noted() {
+    let none = |_: &mut Value| ();
+    assert_eq!(notes(json!({"sortingMethod": "cameraDistance"}), none), Ok(Vec::new()));
+    let found = notes(json!({"sortingMethod": "zDepth"}), none).unwrap();
+    assert_eq!(found, ["sortingMethod \"zDepth\" is ignored: splats are sorted by their depth"]);
+    for (field, value, note) in [
+        ("animations", json!([{"samplers": [], "channels": []}]), Some("animations are ignored")),
+        ("animations", json!([]), None),
+        ("extensionsUsed", json!([SPLATS, VISIBILITY, "KHR_materials_unlit"]), None),
+        ("extensionsUsed", json!([SPLATS, "EXT_x", "EXT_y"]), Some("are ignored: EXT_x, EXT_y")),
+    ] {
+        let found = notes(json!({}), |document| document[field] = value.clone()).unwrap();
+        assert_eq!(found.len(), usize::from(note.is_some()), "{field}: {found:?}");
+        assert!(note.is_none_or(|note| found[0].contains(note)), "{field}: {found:?}");
+    }
+}
+
+/// A hidden node hides the nodes below it.
+#[test]
+fn hidden_splats_are_left_out() {
+    let hidden = json!({VISIBILITY: {"visible": false}});
+    let parent = json!({"children": [1], "extensions": hidden});
+    let with = |nodes: Value| {
+        read_changed([0.5; 3], 0.5, json!({}), |document| {
+            document["extensionsRequired"] = json!([VISIBILITY]);
+            document["nodes"] = nodes.clone();
+        })
+    };
+    let shown = json!({"mesh": 0, "extensions": {VISIBILITY: {"visible": true}}});
+    let file = with(json!([shown])).unwrap();
+    assert_eq!((file.gaussians.len(), file.notes.len()), (1, 0));
+    let file = with(json!([parent, shown, {"mesh": 0}])).unwrap();
+    assert_eq!((file.gaussians.len(), file.notes.len()), (1, 1));
+    assert!(file.notes[0].contains("hidden nodes (KHR_node_visibility)"), "{:?}", file.notes);
+    let message = with(json!([parent, shown])).unwrap_err();
+    assert!(message.contains("all splats are hidden") && message.contains("show"), "{message}");
+}
+
+#[test]
+fn nodes_that_cannot_be_applied_to_splats_are_refused() {
+    let with = |node: Value| notes(json!({}), |document| document["nodes"] = json!([node.clone()]));
+    let instances = json!({"EXT_mesh_gpu_instancing": {"attributes": {"TRANSLATION": 0}}});
+    for (node, words) in [
+        (json!({"mesh": 0, "extensions": instances}), "nodes[0]: EXT_mesh_gpu_instancing"),
+        (json!({"mesh": 0, "skin": 0}), "nodes[0]: a skin"),
+        (json!({"mesh": 0, "scale": [-1, 1, 1]}), "mirror image"),
+        (json!({"mesh": 0, "scale": [1, 2, 1]}), "shear or an uneven scale"),
+    ] {
+        let message = with(node).unwrap_err();
+        assert!(message.contains(words) && message.contains("model.gltf"), "{message}");
+    }
+    // Nodes without splats may have them.
+    let other = json!([{"mesh": 0}, {"scale": [-1, 2, 1], "skin": 0, "extensions": instances}]);
+    assert_eq!(notes(json!({}), |document| document["nodes"] = other.clone()), Ok(Vec::new()));
+}
+
+/// Without a scene, the nodes without a parent are its roots.
+#[test]
+fn nodes_below_others_move_with_them_in_files_without_scenes() {
+    let nodes =
+        json!([{"mesh": 0, "translation": [1, 0, 0]}, {"children": [0], "translation": [0, 2, 0]}]);
+    let change = |document: &mut Value| document["nodes"] = nodes.clone();
+    let found = read_changed([0.5; 3], 0.5, json!({}), change).unwrap().gaussians;
+    assert_eq!((found.len(), found.position(0)), (1, [-1.0, -2.0, 0.0]));
+    let message = notes(json!({}), |document| document["scene"] = json!(3)).unwrap_err();
+    assert!(message.contains("there is no scene 3"), "{message}");
+}
+
+/// No coefficient of spherical harmonics is left out silently.
+#[test]
+fn incomplete_degrees_are_refused_with_the_coefficient() {
+    let with = |names: &[(u8, u8)]| {
+        notes(json!({}), |document| {
+            let attributes = &mut document["meshes"][0]["primitives"][0]["attributes"];
+            for &(degree, n) in names {
+                attributes[coefficient(degree, n)] = attributes[coefficient(0, 0)].clone();
+            }
+        })
+    };
+    let whole = |degree: u8| (1..=degree).flat_map(|d| (0..=2 * d).map(move |n| (d, n)));
+    for degree in 0..=3 {
+        assert_eq!(with(&whole(degree).collect::<Vec<_>>()), Ok(Vec::new()), "degree {degree}");
+    }
+    let four: Vec<(u8, u8)> = whole(4).collect();
+    for (names, words) in [
+        (&[(1, 1), (1, 2), (1, 3)][..], &["SH_DEGREE_1_COEF_1", "missing"][..]),
+        (&[(1, 0), (1, 2)], &["there is no", "SH_DEGREE_1_COEF_1"]),
+        (&[(2, 0), (2, 1), (2, 2), (2, 3), (2, 4)], &["SH_DEGREE_2_COEF_0", "missing"]),
+        (&[(1, 0), (1, 1), (1, 2), (1, 3)], &["SH_DEGREE_1_COEF_3", "no coefficient"]),
+        (&four, &["SH_DEGREE_4_COEF_0", "colours have degree 4, but densify reads 0 to 3"]),
+    ] {
+        let message = with(names).unwrap_err();
+        assert!(words.iter().all(|word| message.contains(word)), "{words:?}: {message}");
     }
 }
 

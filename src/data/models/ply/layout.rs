@@ -33,6 +33,9 @@ pub(crate) const OFFSET: &str = "densify offset";
 /// are exact in f32.
 pub(super) const NEAR: &str = "densify near";
 
+/// The property that holds the radius of Mip-Splatting's 3D filter `[scene units]`.
+pub(super) const FILTER: &str = "filter_3D";
+
 /// Number of [`properties`] before the normals.
 pub(super) const NORMALS_AT: usize = 3;
 

@@ -3,7 +3,8 @@
 use std::path::Path;
 
 use super::activation;
-use super::layout::{NEAR, NORMALS_AT, OFFSET, properties, sh_degree};
+use super::layout::{FILTER, NEAR, NORMALS_AT, OFFSET, properties, sh_degree};
+use super::unread;
 use crate::error::LoadError;
 use crate::models::coordinates::remote_origin;
 use crate::models::rows::{Row, Rows, SplatFile};
@@ -35,7 +36,7 @@ fn remedy(vertices: &Element) -> &'static str {
 ///
 /// # Errors
 /// When the file is unreadable or contradicts itself, a property is missing (as in the compressed
-/// layout), or more than 1 % of the Gaussians are not finite.
+/// layout) or changes what is shown but is not read, or more than 1 % of the Gaussians are not finite.
 pub(super) fn read(path: &Path) -> Result<SplatFile, LoadError> {
     refuse_other_colours(path)?;
     let mut ply = Ply::open(path)?;
@@ -46,9 +47,12 @@ pub(super) fn read(path: &Path) -> Result<SplatFile, LoadError> {
     })?;
     let rest = 3 * (sh_coefficients(sh_degree) - 1);
     let remedy = remedy(&vertices);
-    let mut columns = properties(sh_degree)
-        .map(|name| vertices.column(path, &name, remedy))
+    let names: Vec<String> = properties(sh_degree).collect();
+    let mut columns = names
+        .iter()
+        .map(|name| vertices.column(path, name, remedy))
         .collect::<Result<Vec<_>, _>>()?;
+    let unread = unread::note(path, &vertices, &names)?;
     let (antialiasing, note) = stated_in_comments(path, ply.comments())?;
     let filter = vertices.find(&[FILTER]);
     columns.extend(filter);
@@ -90,6 +94,7 @@ pub(super) fn read(path: &Path) -> Result<SplatFile, LoadError> {
         file.gaussians.antialiasing = antialiasing;
         file.notes.extend(note);
     }
+    file.notes.extend(unread);
     Ok(file)
 }
 
@@ -118,9 +123,6 @@ fn origin_of(path: &Path, vertices: &Element, columns: &[usize]) -> Result<[f64;
     })?;
     Ok(remote_origin(axes))
 }
-
-/// The property that holds the radius f of Mip-Splatting's 3D filter `[scene units]`.
-const FILTER: &str = "filter_3D";
 
 /// Fuses the 3D filter, the last of a Gaussian's values, into its scales s and its opacity o: s′ = √(s² + f²) and o′ =
 /// o·√(Πs²/Πs′²) (Mip-Splatting, equation 7 and `gaussian_model.py`). Returns the values without the filter.

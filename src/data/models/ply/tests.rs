@@ -85,6 +85,43 @@ fn colours_that_are_not_srgb_are_refused() {
     assert!(message.contains("file.ply: color_space: 1 means"), "{message}");
 }
 
+/// Properties that change the look are refused by name, harmless ones are ignored, and all others are named.
+#[test]
+fn properties_that_are_not_read_are_refused_or_noted() {
+    let with = |names: &[&str]| {
+        let mut bytes = written(PLY, &model(1, 0)).unwrap();
+        let end = bytes.windows(11).position(|part| part == b"end_header\n").unwrap();
+        let more: String = names.iter().map(|name| format!("property float {name}\n")).collect();
+        bytes.splice(end..end, more.into_bytes());
+        bytes.extend(vec![0; 4 * names.len()]);
+        let (_folder, path) = saved("file.ply", bytes);
+        read(&path).map(|file| file.notes).map_err(|error| error.to_string())
+    };
+    let long = "x".repeat(90);
+    for (names, noted) in [
+        (&["red", "green", "blue"][..], None),
+        (&["label", "t"], Some("label, t".to_owned())),
+        (&["scale_t"], Some("scale_t".to_owned())),
+        (&["a", "b", "c", "d", "e", "f", "g"], Some("a, b, c, d, e, and 2 more".to_owned())),
+        (&[&long], Some("x".repeat(40))),
+    ] {
+        let expected: Vec<String> =
+            noted.iter().map(|names| format!("properties that are not read: {names}")).collect();
+        assert_eq!(with(names), Ok(expected), "{names:?}");
+    }
+    for (names, words) in [
+        (&["label", "sb_params_0"][..], ["property sb_params_0", "Spherical Betas", "harmonics"]),
+        (&["trbf_center"], ["property trbf_center", "move", "single moment"]),
+        (&["motion_0"], ["property motion_0", "move", "single moment"]),
+        (&["omega_3"], ["property omega_3", "move", "single moment"]),
+        (&["scale_t", "t"], ["property scale_t", "move", "single moment"]),
+        (&["t", "rot_r_0"], ["property rot_r_0", "move", "single moment"]),
+    ] {
+        let message = with(names).unwrap_err();
+        assert!(words.iter().all(|word| message.contains(word)), "{names:?}: {message}");
+    }
+}
+
 /// An interrupted export leaves rows of zeros.
 #[test]
 fn rows_of_zeros_are_dropped_up_to_one_percent() {

@@ -5,7 +5,7 @@
 use std::path::Path;
 
 use super::saved;
-use crate::models::read_model;
+use crate::models::{is_model_folder, read_model};
 use densify_core::antialiasing::Antialiasing;
 use densify_core::gaussians::{Gaussians, sigmoid};
 use densify_fixtures::{corpus, corpus_files};
@@ -216,6 +216,17 @@ fn dishonest_files_are_refused_with_the_reason() {
         ("zeros", vec![0; 320], &["convert"]),
         ("other JSON", b"{\"frames\":[]}".to_vec(), &["not a model", "convert"]),
         ("levels", b"{\"lodLevels\":1}".to_vec(), &["levels of detail", "meta.json files"]),
+        // A tileset has an asset, as glTF does.
+        (
+            "a tileset",
+            br#"{"asset":{},"geometricError":1,"root":{"children":[{"content":{"uri":"a/b.glb"}}]}}"#.to_vec(),
+            &["a tileset (3D Tiles)", "name a file that it lists, such as a/b.glb"],
+        ),
+        (
+            "an empty tileset",
+            br#"{"asset":{},"geometricError":1,"root":{}}"#.to_vec(),
+            &["a tileset (3D Tiles)", "name one of the files"],
+        ),
         ("a ZIP", archive(&[("a.ply", b"ply")]), &["ZIP archive, but no SOG", "unpack it"]),
         (
             "a model among others",
@@ -278,8 +289,16 @@ fn dishonest_files_are_refused_with_the_reason() {
             assert!(message.contains(word), "{case}: {word:?} is not in: {message}");
         }
     }
-    let message = read_model(tempfile::tempdir().unwrap().path()).unwrap_err().to_string();
+    let folder = tempfile::tempdir().unwrap();
+    let message = read_model(folder.path()).unwrap_err().to_string();
     assert!(message.contains("without meta.json"), "{message}");
+    // The folder of a streamed model.
+    std::fs::write(folder.path().join("lod-meta.json"), "{\"lodLevels\":1}").unwrap();
+    let message = read_model(folder.path()).unwrap_err().to_string();
+    assert!(
+        is_model_folder(folder.path()) && message.contains("lod-meta.json is a list"),
+        "{message}"
+    );
 }
 
 #[test]
