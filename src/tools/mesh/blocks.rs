@@ -50,11 +50,6 @@ impl Grid {
         (fits && voxel > 0.0).then_some(Self { low: region.low, voxel, blocks })
     }
 
-    /// The scene point of a position `[voxels]`.
-    pub(super) fn scene(&self, position: DVec3) -> DVec3 {
-        self.low + position * self.voxel
-    }
-
     /// Adds the blocks with a voxel closer to a scene point than the truncation, along every axis.
     fn near(&self, point: DVec3, keys: &mut Vec<Key>) {
         let position = (point - self.low) / self.voxel;

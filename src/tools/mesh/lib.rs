@@ -20,6 +20,7 @@ mod fusion;
 mod mesh;
 mod model;
 mod nets;
+mod score;
 mod write;
 
 use densify_core::camera::Camera;
@@ -27,10 +28,12 @@ use densify_core::memory::Bytes;
 use densify_run::Observer;
 use densify_run::failure::Failure;
 
+pub use densify_train::metrics::geometry::MeshErrors;
 pub use extent::Region;
 pub use frame::DepthFrame;
 pub use mesh::Mesh;
 pub use model::{DepthKind, ModelSource};
+pub use score::score;
 pub use write::MeshFormat;
 
 use blocks::Grid;
@@ -62,6 +65,8 @@ pub struct FuseOptions {
     pub min_component: f64,
     /// Memory for depth maps, voxels and the mesh `[bytes]`.
     pub memory: u64,
+    /// Scene units per unit of the dataset, in which lengths are told.
+    pub unit: f64,
 }
 
 /// Default number of voxels along the scene's diagonal.
@@ -100,8 +105,8 @@ pub enum MeshError {
     Nothing,
     /// The grid or the mesh does not fit into the memory, even in passes.
     #[error(
-        "the memory is too small for voxels of {voxel} (1/{} of the scene's diagonal): {part} takes {}, and {} is left \
-         for it", (diagonal / voxel).round(), Bytes(*needed), Bytes(*left)
+        "the memory is too small for voxels of {voxel} (1/{} of the scene's diagonal): {part} takes {}, and {} is left",
+        (diagonal / voxel).round(), Bytes(*needed), Bytes(*left)
     )]
     Memory {
         /// What does not fit.
@@ -110,22 +115,34 @@ pub enum MeshError {
         needed: u64,
         /// Memory that is left for it `[bytes]`.
         left: u64,
-        /// Length of a voxel `[scene units]`.
+        /// Length of a voxel `[units of the dataset]`.
         voxel: f64,
-        /// Diagonal of the scene `[scene units]`.
+        /// Diagonal of the scene `[units of the dataset]`.
         diagonal: f64,
     },
     /// The grid has too many voxels along an axis.
     #[error("voxels of {voxel} are too small for a scene with a diagonal of {diagonal}")]
     TooFine {
-        /// Length of a voxel `[scene units]`.
+        /// Length of a voxel `[units of the dataset]`.
         voxel: f64,
-        /// Diagonal of the scene `[scene units]`.
+        /// Diagonal of the scene `[units of the dataset]`.
         diagonal: f64,
     },
     /// Nothing is left of the surface.
-    #[error("no surface was found: the views contradict each other; try larger voxels")]
+    #[error("no surface was found: the views contradict each other")]
     Empty,
+}
+
+impl MeshError {
+    /// The remedy, as the end of a message for the command line.
+    pub fn remedy(&self) -> &'static str {
+        match self {
+            Self::Source(_) => "",
+            Self::Nothing => "; check that the model belongs to the dataset, and the box",
+            Self::Memory { .. } => "; give more --memory, a larger --voxel, or a --box",
+            Self::TooFine { .. } | Self::Empty => "; give a larger --voxel",
+        }
+    }
 }
 
 /// Fuses the depth maps of a source.
@@ -143,11 +160,13 @@ pub fn fuse(
     let extent = extent::survey(&mut frames, options.region)?;
     let diagonal = extent.diagonal;
     let voxel = options.voxel.unwrap_or(diagonal / VOXELS);
-    let grid = Grid::new(&extent.region, voxel).ok_or(MeshError::TooFine { voxel, diagonal })?;
-    let limits = Limits { memory, voxel, diagonal };
+    let limits = Limits { memory, voxel: voxel / options.unit, diagonal: diagonal / options.unit };
+    let Limits { voxel: told, diagonal: told_diagonal, .. } = limits;
+    let too_fine = MeshError::TooFine { voxel: told, diagonal: told_diagonal };
+    let grid = Grid::new(&extent.region, voxel).ok_or(too_fine)?;
     let keys = blocks::collect(&mut frames, &grid, &limits)?;
     observer.say(format_args!(
-        "grid     {} blocks of 8³ voxels, {:.0} voxels per diagonal",
+        "grid     {} blocks of 8³ voxels of {told:.4} (1/{:.0} of the scene's diagonal)",
         densify_core::numbers::grouped(keys.len()),
         diagonal / voxel
     ));
@@ -166,7 +185,9 @@ pub fn fuse(
 struct Limits {
     /// Memory for voxels and the mesh `[bytes]`.
     memory: u64,
+    /// Length of a voxel `[units of the dataset]`.
     voxel: f64,
+    /// Diagonal of the scene `[units of the dataset]`.
     diagonal: f64,
 }
 

@@ -284,3 +284,7 @@ impl WithSimd for Weights<'_> {
         }
     }
 }
+
+#[cfg(test)]
+#[allow(clippy::float_cmp, reason = "exact values")]
+mod tests;
