@@ -40,12 +40,14 @@
 //! compares backends with it), `study` (`compare`, `trade` and `report`), `view` (a page in the browser).
 
 pub use densify_blocks as blocks;
+pub use densify_clean as clean;
 pub use densify_cli as cli;
 pub use densify_compress as compress;
 pub use densify_core as core;
 pub use densify_data as data;
 pub use densify_inspect as inspect;
 pub use densify_launch as launch;
+pub use densify_mesh as mesh;
 pub use densify_render as render;
 pub use densify_run as run;
 #[cfg(feature = "selftest")]

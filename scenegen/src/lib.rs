@@ -50,7 +50,7 @@ pub use points::{InitPoints, PointCollector, PointOptions};
 pub use presets::{PRESETS, Preset, PresetSpec};
 pub use resource::data_uri;
 pub use rig::{Rig, RigKind, Survey};
-pub use scene::{Generated, Options, Scene, Source, Split, View, generate};
+pub use scene::{Generated, Options, Scene, Source, Split, View, generate, read_mesh};
 pub use shade::Ambient;
 pub use sky::Sky;
 pub use surface::{Surface, SurfaceHit};

@@ -2,7 +2,7 @@
 //!
 //! The file exceeds 400 lines because geometry, cameras, light and exposure each depend on those before.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
@@ -356,6 +356,22 @@ fn check(options: &Options) -> Result<(), Error> {
     Ok(())
 }
 
+/// Reads the mesh of a `.gltf`, `.glb` or `.obj` file.
+///
+/// # Errors
+/// When the file is unreadable, malformed, has no triangle or needs an unsupported feature.
+pub fn read_mesh(path: &Path) -> Result<Model, Error> {
+    let extension = path.extension().map(|e| e.to_string_lossy().to_lowercase());
+    match extension.as_deref() {
+        Some("gltf" | "glb") => gltf::load(path),
+        Some("obj") => obj::load(path),
+        _ => {
+            let feature = "a file that is neither .gltf, .glb nor .obj";
+            Err(Error::unsupported(path, feature, "export the mesh to one of them"))
+        }
+    }
+}
+
 fn stage(source: &Source, seed: u64) -> Result<(String, Staging, Vec<FileCamera>), Error> {
     match source {
         Source::Preset(name) => {
@@ -365,19 +381,7 @@ fn stage(source: &Source, seed: u64) -> Result<(String, Staging, Vec<FileCamera>
             Ok((spec.to_string(), staging, Vec::new()))
         }
         Source::File(path) => {
-            let extension = path.extension().map(|e| e.to_string_lossy().to_lowercase());
-            let model = match extension.as_deref() {
-                Some("gltf" | "glb") => gltf::load(path)?,
-                Some("obj") => obj::load(path)?,
-                _ => {
-                    let feature = "a file that is neither .gltf, .glb nor .obj";
-                    return Err(Error::unsupported(
-                        path,
-                        feature,
-                        "export the mesh to one of them",
-                    ));
-                }
-            };
+            let model = read_mesh(path)?;
             let cameras = model.cameras.clone();
             let staging = Staging {
                 sky: open_sky(),

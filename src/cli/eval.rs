@@ -7,8 +7,10 @@ use std::path::PathBuf;
 use clap::{ArgMatches, Args};
 
 use super::console::Console;
+use super::mesh;
 use super::render::{ModelArgument, RenderingArgs};
 use densify_core::numbers::{grouped, percent};
+use densify_data::meshes::is_mesh;
 use densify_data::views::ViewSource;
 use densify_inspect::{Limit, LimitError, Limits, Side, measured_values};
 use densify_run::RunConfig;
@@ -28,10 +30,14 @@ use densify_train::output::{write_geometry, write_scores};
 /// the dataset or an option selects others. Where the geometry is known (built-in scenes, and those that
 /// `densify scenegen` wrote), also measures how well the Gaussians match it: in a second table, and in geometry.json
 /// (geometry_train.json).
+///
+/// A triangle mesh (.ply with faces, .glb, .obj) in the dataset's coordinates is measured against the known surface
+/// instead: mean distances in both directions, and F-scores, the harmonic means of the shares of the mesh and of the
+/// surface (where two training views see it) that are within 0.5 and 1 % of the diagonal from the other.
 #[derive(Debug, Args)]
 #[command(after_help = EXAMPLES)]
 pub(super) struct EvalArgs {
-    /// Folder that `densify train` wrote, or a file of Gaussian splats (for SOG, also a folder)
+    /// Folder that `densify train` wrote, or a file of Gaussian splats (for SOG, also a folder), or a mesh
     #[arg(value_name = "RUN_OR_MODEL")]
     model: PathBuf,
     /// Saved iteration of the run `[default: the last]`
@@ -70,11 +76,15 @@ Examples:
   densify eval output/garden-diet --iteration 7000 --split train
   densify eval output/garden-diet --lpips lpips-vgg.safetensors
   densify eval others.spz --scene data/garden -r 4
-  densify eval output/garden-diet --fail-below psnr=25 --fail-above flip=0.1";
+  densify eval output/garden-diet --fail-below psnr=25 --fail-above flip=0.1
+  densify eval room.ply --scene scene:room --fail-below f_score_one_percent=0.9";
 
 pub(super) fn run(args: &EvalArgs, matches: &ArgMatches, console: &Console) -> Result<(), Failure> {
     let model = &args.model;
     let limits = Limits { lowest: &args.fail_below, highest: &args.fail_above };
+    if is_mesh(model) {
+        return mesh::evaluate(model, args.scene.as_deref(), (&args.rendering, limits), console);
+    }
     // A folder without config.toml is not a run, and is refused whatever other files it holds.
     let run = if is_model(model) {
         None
@@ -132,7 +142,7 @@ pub(super) fn run(args: &EvalArgs, matches: &ArgMatches, console: &Console) -> R
 }
 
 /// The failure; its message names the options.
-fn with_option_names(error: LimitError) -> Failure {
+pub(super) fn with_option_names(error: LimitError) -> Failure {
     let code = match error {
         LimitError::Unknown { .. } => INPUT,
         LimitError::Exceeded(_) => LIMIT,

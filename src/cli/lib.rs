@@ -14,6 +14,7 @@
 //! ```
 
 mod blocks;
+mod clean;
 mod compress;
 mod console;
 #[cfg(feature = "gpu")]
@@ -24,6 +25,7 @@ mod film;
 mod flags;
 mod interrupt;
 mod knobs;
+mod mesh;
 mod plan;
 mod policies;
 mod progress;
@@ -84,6 +86,9 @@ Examples:
   densify export output/garden-diet -o garden.ply          the model as a file for other programs
   densify compress output/garden-diet --to 5MiB -o garden.sog
                                                            a smaller file of the model
+  densify clean output/garden-diet -o garden-clean.ply --refine 1000
+                                                           the model without floaters
+  densify mesh output/garden-diet -o garden.glb            a triangle mesh of the surface
   densify blocks plan data/city -o city --rows 2M --memory 8GiB
                                                            a scene too large for one machine
   densify compare data/garden --policies vanilla,diet --budget 200k
@@ -113,8 +118,10 @@ enum Command {
     #[command(after_help = PLAN_EXAMPLES)]
     Plan(Box<train::TrainArgs>),
     Eval(Box<eval::EvalArgs>),
+    Clean(Box<clean::CleanArgs>),
     Compress(Box<compress::CompressArgs>),
     Export(Box<export::ExportArgs>),
+    Mesh(Box<mesh::MeshArgs>),
     Render(Box<render::RenderArgs>),
     Report(report::ReportArgs),
     Compare(study::Comparison),
@@ -164,7 +171,9 @@ pub fn run_with(arguments: impl IntoIterator<Item = impl Into<OsString> + Clone>
         Command::Blocks(args) => blocks::run(&args, &console),
         Command::Plan(train) => plan::run(&train, given, &console),
         Command::Eval(eval) => eval::run(&eval, given, &console),
+        Command::Clean(args) => clean::run(&args, given, &console),
         Command::Compress(compress) => compress::run(&compress, given, &console),
+        Command::Mesh(args) => mesh::run(&args, given, &console),
         Command::Export(export) => export::run(&export, given, &console),
         Command::Render(render) => render::run(&render, given, &console),
         Command::Report(report) => report::run(&report, &console),
@@ -190,8 +199,10 @@ pub fn run_with(arguments: impl IntoIterator<Item = impl Into<OsString> + Clone>
 /// The parser, with the defaults of a run's options filled in for every command that takes such options.
 #[must_use]
 pub fn command() -> clap::Command {
-    const WITH_RUN_OPTIONS: [&str; 9] =
-        ["train", "plan", "compress", "eval", "export", "render", "report", "selftest", "view"];
+    const WITH_RUN_OPTIONS: [&str; 11] = [
+        "train", "plan", "clean", "compress", "eval", "export", "mesh", "render", "report",
+        "selftest", "view",
+    ];
     WITH_RUN_OPTIONS.iter().fold(Arguments::command(), |command, name| {
         command.mut_subcommand(name, flags::with_defaults)
     })

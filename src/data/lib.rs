@@ -1,11 +1,12 @@
 //! Readers of other programs' files (datasets and models of Gaussian splats in all formats), and writers of models.
 //! This layer depends on neither backends nor runs.
 //!
-//! Its modules in order, each using only those before it: `error`, `picture_file`, `ply`, [`models`], [`points`],
+//! Its modules in order, each using only those before it: `error`, `picture_file`, `ply`, [`meshes`], [`models`], [`points`],
 //! [`dataset`], [`track_colours`] and [`views`].
 
 pub mod dataset;
 mod error;
+pub mod meshes;
 pub mod models;
 mod picture_file;
 mod ply;

@@ -4,6 +4,33 @@ use densify_core::camera::Camera;
 
 use super::{BackendError, Rendering};
 
+/// Depths of a view: camera-space z, with each row at the depth of its mean `[scene units]`. Shape of each:
+/// `[height, width]`.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct SurfaceDepths {
+    /// Width `[px]`.
+    pub width: u32,
+    /// Height `[px]`.
+    pub height: u32,
+    /// 1 − final transmittance, in `[0, 1]`.
+    pub alpha: Vec<f32>,
+    /// Expected depth Σ α·T·z / Σ α·T; 0 where alpha is 0.
+    pub expected: Vec<f32>,
+    /// Depth of the row at which transmittance falls below ½; 0 where it does not.
+    pub median: Vec<f32>,
+    /// Standard deviation of the depths with weights α·T; 0 where alpha is 0.
+    pub spread: Vec<f32>,
+}
+
+/// Blend weights of a row, summed over the pixels of a view.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct RowWeights {
+    /// Σ α·T over the pixels in which the row's mean is nearer than a given depth.
+    pub in_front: f32,
+    /// Σ α·T over all pixels.
+    pub whole: f32,
+}
+
 /// Renders properties of the rows instead of their colours.
 pub trait Inspect {
     /// Renders a view with the given colours instead of the rows' own: sRGB-encoded, >= 0, the same from every
@@ -32,5 +59,29 @@ pub trait Inspect {
     /// [`BackendError::Unsupported`] unless the backend [counts rows](Self::counts_rows).
     fn render_counts(&mut self, _camera: &Camera) -> Result<Rendering, BackendError> {
         Err(BackendError::Unsupported("counting the Gaussians per pixel"))
+    }
+    /// Renders the depths of a view.
+    ///
+    /// # Errors
+    /// [`BackendError::Unsupported`] on a GPU.
+    fn render_depths(&mut self, _camera: &Camera) -> Result<SurfaceDepths, BackendError> {
+        Err(BackendError::Unsupported("median depth"))
+    }
+
+    /// Measures the weight of each row in a view, and the part of it that is nearer than `surface` (camera-space z
+    /// `[scene units]`; nothing is nearer than 0. Shape: `[height, width]`). Model and signals are unchanged. Shape of
+    /// the result: `[rows]`.
+    ///
+    /// # Errors
+    /// [`BackendError::Unsupported`] on a GPU.
+    ///
+    /// # Panics
+    /// When there is not one depth per pixel: a bug in the caller.
+    fn weights_in_front(
+        &mut self,
+        _camera: &Camera,
+        _surface: &[f32],
+    ) -> Result<Vec<RowWeights>, BackendError> {
+        Err(BackendError::Unsupported("weights in front of a surface"))
     }
 }

@@ -42,7 +42,7 @@ use densify_core::memory::Ledger;
 pub use densify_shaders::Accumulation;
 pub use differentiable::{Differentiable, ImageGradient};
 pub use error::{BackendError, Fit};
-pub use inspect::Inspect;
+pub use inspect::{Inspect, RowWeights, SurfaceDepths};
 pub use setup::{KeptPhotographs, MomentStorage, ParameterStorage, Setup, Shortcuts, Storage};
 pub use state::{StateArray, StateError, Tensor, Values};
 

@@ -95,10 +95,12 @@ const LAYERS: [&[(&str, &str)]; 9] = [
     &[("densify-train", "src/train")],
     &[("densify-run", "src/run"), ("densify-selftest", "src/tools/selftest")],
     &[
+        ("densify-clean", "src/tools/clean"),
         ("densify-compress", "src/tools/compress"),
         ("densify-html", "src/tools/html"),
         ("densify-inspect", "src/tools/inspect"),
         ("densify-launch", "src/tools/launch"),
+        ("densify-mesh", "src/tools/mesh"),
     ],
     &[
         ("densify-blocks", "src/tools/blocks"),
@@ -198,7 +200,17 @@ const MODULES: [(&str, &[&str]); 5] = [
     ),
     (
         "src/data",
-        &["error", "picture_file", "ply", "models", "points", "dataset", "track_colours", "views"],
+        &[
+            "error",
+            "picture_file",
+            "ply",
+            "meshes",
+            "models",
+            "points",
+            "dataset",
+            "track_colours",
+            "views",
+        ],
     ),
     (
         "src/render",

@@ -107,6 +107,12 @@ impl Element {
         self.find_by(names, |own, name| own == name)
     }
 
+    /// Index of the list with the first of these names that exists.
+    pub(crate) fn find_list(&self, names: &[&str]) -> Option<usize> {
+        let is_list = |p: &Property, name: &str| p.list.is_some() && p.name == name;
+        names.iter().find_map(|name| self.properties.iter().position(|p| is_list(p, name)))
+    }
+
     /// As [`find`](Self::find), ignoring case.
     pub(crate) fn find_in_any_case(&self, names: &[&str]) -> Option<usize> {
         self.find_by(names, str::eq_ignore_ascii_case)

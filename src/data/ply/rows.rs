@@ -11,6 +11,8 @@ use densify_core::files;
 
 /// Longest number accepted in an ascii file `[bytes]`.
 const MAX_WORD: usize = 128;
+/// Longest list that is read.
+const MAX_LIST: f64 = 1024.0;
 
 /// A PLY file whose header has been read.
 pub(crate) struct Ply<'a> {
@@ -93,6 +95,46 @@ impl<'a> Ply<'a> {
         }
         self.rows(wanted, columns, &mut each)?;
         self.passed += skipped.len() + 1;
+        self.header.elements = elements;
+        Ok(())
+    }
+
+    /// Calls `each` with the list `column` of every row of `wanted`, the only element read after those that were read
+    /// or skipped. A list with more than [`MAX_LIST`] values is refused.
+    pub(crate) fn each_list(
+        &mut self,
+        wanted: &Element,
+        column: usize,
+        mut each: impl FnMut(u64, &[f64]) -> Result<(), String>,
+    ) -> Result<(), LoadError> {
+        let elements = std::mem::take(&mut self.header.elements);
+        let place = elements.iter().position(|element| element.name == wanted.name);
+        for element in elements.get(self.passed..place.unwrap_or(0)).unwrap_or_default() {
+            self.rows(element, &[], &mut |_| ())?;
+        }
+        let mut list = Vec::new();
+        for index in 0..wanted.rows {
+            for (at, property) in wanted.properties.iter().enumerate() {
+                let Some(length) = property.list else {
+                    self.scalar(wanted, index, property.kind)?;
+                    continue;
+                };
+                if at != column {
+                    self.skip_list(wanted, index, length, property.kind)?;
+                    continue;
+                }
+                let length = self.scalar(wanted, index, length)?;
+                if !(0.0..=MAX_LIST).contains(&length) {
+                    return Err(self.fault(wanted, index, format!("a list of length {length}")));
+                }
+                list.clear();
+                for _ in 0..length as u64 {
+                    list.push(self.scalar(wanted, index, property.kind)?);
+                }
+            }
+            each(index, &list).map_err(|problem| self.fault(wanted, index, problem))?;
+        }
+        self.passed = place.map_or(self.passed, |place| place + 1);
         self.header.elements = elements;
         Ok(())
     }

@@ -36,6 +36,7 @@ mod simd;
 mod stage_clock;
 mod state;
 mod summed;
+mod surface;
 mod threads;
 mod tiles;
 
@@ -52,8 +53,9 @@ use pulp::Arch;
 use super::candidates::{Candidates, Photograph, error_weights};
 use super::signals::{Field, counts_dominant};
 use super::{
-    AuxInput, AuxOutput, Backend, BackendError, Inspect, NonFinite, Rendering, Setup, Shortcuts,
-    StateArray, StateError, StepInput, StepOutput, Tensor, assert_fits, assert_same_size,
+    AuxInput, AuxOutput, Backend, BackendError, Inspect, NonFinite, Rendering, RowWeights, Setup,
+    Shortcuts, StateArray, StateError, StepInput, StepOutput, SurfaceDepths, Tensor, assert_fits,
+    assert_same_size,
 };
 pub(crate) use adam::BiasCorrection;
 use blocks::{Blocks, planes};
@@ -392,5 +394,17 @@ impl Inspect for CpuBackend {
     fn render_counts(&mut self, camera: &Camera) -> Result<Rendering, BackendError> {
         let frame = self.forward(camera, [0.0; 3], 0, DepthPlane::BlendedCount, None)?;
         Ok(self.rendering(&frame))
+    }
+
+    fn render_depths(&mut self, camera: &Camera) -> Result<SurfaceDepths, BackendError> {
+        self.depths_of_view(camera)
+    }
+
+    fn weights_in_front(
+        &mut self,
+        camera: &Camera,
+        surface: &[f32],
+    ) -> Result<Vec<RowWeights>, BackendError> {
+        self.weights_in_view(camera, surface)
     }
 }

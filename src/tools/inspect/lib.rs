@@ -9,5 +9,5 @@ mod pictures;
 
 pub use fidelity::Reference;
 pub use film::{CameraRoute, Film, FilmError, FilmOptions, FilmSource};
-pub use limits::{Limit, LimitError, Limits, Side, measured_values};
+pub use limits::{Limit, LimitError, Limits, Side, measured_values, mesh_values};
 pub use pictures::{Channels, PictureFolder, file_names};

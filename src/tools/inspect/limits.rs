@@ -7,7 +7,7 @@ use std::str::FromStr;
 use serde_json::Value;
 
 use densify_train::evaluate::Mean;
-use densify_train::metrics::geometry::{Geometry, ThinRecall};
+use densify_train::metrics::geometry::{Geometry, MeshErrors, ThinRecall};
 
 /// A bound on a measured value. As text: `KEY=NUMBER`.
 #[derive(Debug, Clone, PartialEq)]
@@ -80,6 +80,15 @@ pub fn measured_values(mean: &Mean, geometry: Option<&Geometry>) -> BTreeMap<Str
     values
 }
 
+/// The values of a mesh that limits may name.
+pub fn mesh_values(errors: &MeshErrors) -> BTreeMap<String, f64> {
+    let mut values = BTreeMap::new();
+    if let Ok(errors) = serde_json::to_value(errors) {
+        flatten("", &errors, &mut values);
+    }
+    values
+}
+
 fn flatten(prefix: &str, value: &Value, values: &mut BTreeMap<String, f64>) {
     let path = |key: &str| match prefix {
         "" => key.to_owned(),
@@ -124,6 +133,17 @@ impl Limits<'_> {
         Ok(())
     }
 
+    /// Checks that every limit names one of the values that will be measured.
+    ///
+    /// # Errors
+    /// [`LimitError::Unknown`].
+    pub fn check_known(&self, known: &BTreeMap<String, f64>) -> Result<(), LimitError> {
+        match self.each().find(|(_, limit)| !known.contains_key(&limit.key)) {
+            Some((side, limit)) => Err(LimitError::unknown(side, &limit.key, known)),
+            None => Ok(()),
+        }
+    }
+
     /// Checks that every value was measured and is within its limit.
     ///
     /// # Errors
@@ -148,7 +168,7 @@ impl Limits<'_> {
 
 impl LimitError {
     fn unknown(side: Side, key: &str, known: &BTreeMap<String, f64>) -> Self {
-        let has_geometry = known.contains_key("depth.rmse");
+        let has_geometry = known.contains_key("depth.rmse") || !known.contains_key("psnr");
         let known = known.keys().cloned().collect();
         Self::Unknown { side, key: key.to_owned(), known, has_geometry }
     }

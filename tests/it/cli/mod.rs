@@ -7,6 +7,7 @@ mod blocks;
 #[cfg(unix)]
 mod caching;
 mod camera_paths;
+mod cleaning;
 mod comparing;
 mod compressing;
 mod configuring;
@@ -24,6 +25,7 @@ mod killing;
 mod knobs;
 mod live_page;
 mod memory;
+mod meshing;
 mod model_formats;
 mod neutral_options;
 mod photographing;

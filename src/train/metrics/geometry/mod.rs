@@ -12,7 +12,7 @@ use serde::{Deserialize, Deserializer, Serialize};
 
 use densify_data::dataset::GroundTruth;
 use densify_data::dataset::normalise::Normalisation;
-pub use measure::measure;
+pub use measure::{MeshErrors, measure, measure_mesh};
 
 /// The measurements. Values without data (no centre, no pixel, no thin structure) are NaN, or `null` in JSON.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]

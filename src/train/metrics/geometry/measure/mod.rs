@@ -1,6 +1,7 @@
 //! Measures a model against the surface, with weights and visibility from the training views.
 
 mod centres;
+mod mesh;
 mod pixels;
 mod rows;
 mod visibility;
@@ -14,6 +15,7 @@ use crate::metrics::EvaluateError;
 use densify_core::camera::Camera;
 use densify_data::views::ViewSource;
 use densify_render::Backend;
+pub use mesh::{MeshErrors, measure_mesh};
 use pixels::Pixels;
 use rows::Rows;
 use visibility::Visibility;

@@ -290,3 +290,48 @@ fn measurements_without_data_are_nan() {
     let back: Geometry = serde_json::from_str(&text).unwrap();
     assert!(back.depth.rmse.is_nan() && back.depth.coverage == 0.0);
 }
+
+/// A mesh of triangles with vertices of their own.
+fn mesh_of(triangles: &[[DVec3; 3]]) -> densify_scenegen::mesh::Model {
+    densify_scenegen::mesh::Model {
+        positions: triangles.as_flattened().to_vec(),
+        triangles: (0..triangles.len() as u32).map(|t| [0, 1, 2].map(|c| 3 * t + c)).collect(),
+        ..Default::default()
+    }
+}
+
+#[test]
+fn meshes_are_measured_in_both_directions() {
+    // A second square behind the first, which no camera sees, needs no mesh.
+    let mut triangles = square();
+    triangles.extend(square().into_iter().map(|t| t.map(|p| p + DVec3::Z)));
+    let truth = truth(&triangles, 4);
+    let scene = KnownScene {
+        truth: &truth,
+        normalisation: &WORLD,
+        background: [0.0; 3],
+        sh_degree: 0,
+        is_stopped: &|| false,
+    };
+    let measured = |triangles: &[[DVec3; 3]]| {
+        measure_mesh(&mesh_of(triangles), &scene, &Pair::new().cameras).unwrap()
+    };
+    let diagonal = scene.diagonal();
+    let exact = measured(&square());
+    assert!(exact.chamfer < 1e-6 && exact.f_score_half_percent == 1.0, "{exact:?}");
+    // Moved by 0.8 % of the diagonal.
+    let offset = DVec3::new(0.0, 0.0, -0.008 * diagonal);
+    let corners = |triangle: [DVec3; 3]| triangle.map(|corner| corner + offset);
+    let moved = measured(&square().into_iter().map(corners).collect::<Vec<_>>());
+    close(moved.accuracy, 0.008, 1e-6);
+    close(moved.completeness, 0.008, 1e-6);
+    assert_eq!((moved.f_score_half_percent, moved.f_score_one_percent), (0.0, 1.0));
+    // One of the two triangles: half the surface is within the limit, and a strip beside the diagonal.
+    let half = measured(&square()[..1]);
+    assert!(half.accuracy < 1e-6 && half.precision_one_percent == 1.0);
+    let strip = 0.01 * diagonal * 2.0 * 2f64.sqrt() / 4.0;
+    close(half.recall_one_percent, 0.5 + strip, 0.01);
+    let recall = half.recall_one_percent;
+    close(half.f_score_one_percent, 2.0 * recall / (1.0 + recall), 1e-12);
+    assert!(measure_mesh(&mesh_of(&[]), &scene, &Pair::new().cameras).is_err());
+}

@@ -25,7 +25,7 @@ const MIN_DISTANCE: f64 = 0.01;
 /// Blend weight below which a row has a negligible effect.
 const NEGLIGIBLE: f32 = 0.01;
 /// Minimum number of views that see through a floater's position, or that see a counted sample of the mesh.
-const MIN_VIEWS: u32 = 2;
+pub(super) const MIN_VIEWS: u32 = 2;
 
 /// Sums over the training views.
 pub(super) struct Visibility {
@@ -164,7 +164,7 @@ fn sees_through(camera: &Camera, g_buffer: &GBuffer, place: DVec3) -> bool {
 }
 
 /// Samples of uniform density on the triangles, in the order of the triangles.
-fn sample(triangles: &[[DVec3; 3]]) -> Vec<DVec3> {
+pub(super) fn sample(triangles: &[[DVec3; 3]]) -> Vec<DVec3> {
     let area = |[a, b, c]: &[DVec3; 3]| 0.5 * (*b - *a).cross(*c - *a).length();
     let total: f64 = triangles.iter().map(area).sum();
     if !(total > 0.0 && total.is_finite()) {
