@@ -225,8 +225,7 @@ pub(super) fn rebound(formats: Formats) -> HashMap<&'static str, Vec<Vec<Rebindi
         // Borrows the sums of the rows, which are unused before the backward pass.
         ("surface", vec![vec![("pixels", "ops"), ("points", "row sums")]]),
         ("count_errors", two(&|i| vec![("map", ERROR_MAPS[i])])),
-        ("narrow", vec![vec![("worst", "gradient")]]),
-        ("write_worst", two(&|i| vec![("map", ERROR_MAPS[i]), ("worst", "gradient")])),
+        ("write_worst", two(&|i| vec![("map", ERROR_MAPS[i])])),
         ("replay", vec![vec![("map", "pixel gradient")]]),
         ("gather", vec![vec![("all records", "records")]]),
         ("gather_columns", vec![vec![("all records", "records")]]),

@@ -10,7 +10,6 @@ use densify_policies::policy::{
 use super::GpuBackend;
 use super::frame::Frame;
 use super::passes::{Search, Shape};
-use super::rows::GRADIENT;
 use super::sizes::OPS_BYTES;
 use crate::candidates::{Photograph, count_to_rank};
 use crate::cpu::EXPONENT_SCALE;
@@ -32,8 +31,10 @@ impl GpuBackend {
         count: usize,
         [width, height, ..]: [u32; 4],
     ) -> Option<Search> {
-        // The result, which begins with its length, borrows the range of the rows' gradients.
-        let room = (GRADIENT / 2 * self.sizes.trained() as usize - 1).min(u32::MAX as usize);
+        // The result begins with its length.
+        let ranges = self.sizes.ranges();
+        let bytes = ranges.iter().find(|range| range.name == "worst").map_or(0, |r| r.bytes);
+        let room = (bytes / 8).saturating_sub(1).min(u32::MAX.into()) as usize;
         let wanted = count_to_rank(count, request.spaced);
         (wanted <= room).then_some(Search {
             pixels: width * height,
@@ -74,13 +75,13 @@ impl GpuBackend {
     fn search_result(&self, search: &Search) -> Result<Option<Vec<(f32, u32)>>, BackendError> {
         // The pixels wanted, and a few whose errors equal that of the last one.
         let likely = (search.wanted + 63).min(search.room);
-        let mut read = self.read("gradient", 0, 8 * (1 + u64::from(likely)))?;
+        let mut read = self.read("worst", 0, 8 * (1 + u64::from(likely)))?;
         let count = read[0].to_bits();
         if count > search.room {
             return Ok(None);
         }
         if count > likely {
-            read = self.read("gradient", 0, 8 * (1 + u64::from(count)))?;
+            read = self.read("worst", 0, 8 * (1 + u64::from(count)))?;
         }
         let pairs = read.as_chunks::<2>().0[1..].iter().take(count as usize);
         Ok(Some(pairs.map(|[error, pixel]| (*error, pixel.to_bits())).collect()))

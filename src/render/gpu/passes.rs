@@ -280,8 +280,8 @@ impl Passes<'_> {
         to.run(l.get("adam_geometry"), [0; 4], groups);
     }
 
-    /// Writes the pixels with the largest errors to the range of the rows' gradients: their number, then the error
-    /// bits and the index of each, as many as fit. Pixels whose error equals that of the last one wanted are included.
+    /// Writes the pixels with the largest errors to the range "worst": their number, then the error bits and the index
+    /// of each, as many as fit. Pixels whose error equals that of the last one wanted are included.
     pub(super) fn worst(&self, to: &mut Recorder<'_>, search: &Search) {
         let l = self.launches;
         let &Search { pixels, wanted, room, min_alpha, of_gradient } = search;

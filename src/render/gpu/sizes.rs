@@ -5,7 +5,7 @@ use wgpu::BufferUsages;
 
 use super::exposure;
 use super::frame::{Frame, State, grid};
-use super::rows::{Content, GRADIENT, Narrow, RowArray, row_arrays};
+use super::rows::{Content, Narrow, RowArray, row_arrays};
 use crate::Accumulation;
 use crate::cpu::BiasCorrection;
 use crate::signals::{Field, RecordLayout, SignalPlanes, counts_dominant};
@@ -180,7 +180,7 @@ impl Sizes {
     }
 
     /// The ranges of [`SCRATCH`]. Three uses follow each other in a step: sorting rows and entries, the loss, and the
-    /// gradients of rows between the backward pass and the optimiser.
+    /// pixels with the largest errors.
     pub(super) fn ranges(&self) -> Vec<ScratchRange> {
         let range = |line, name, at, bytes: u64| {
             let bytes = bytes.max(16).next_multiple_of(16);
@@ -194,7 +194,9 @@ impl Sizes {
             .collect();
         let (width, height) = self.image;
         all.push(range("loss", "derivatives", 0, 36 * u64::from(width) * u64::from(height)));
-        all.push(range("row gradients", "gradient", 0, 4 * GRADIENT as u64 * self.trained()));
+        // As long as the longest of the others, which a kernel can bind.
+        let largest = all.iter().map(|range| range.bytes).max().unwrap_or(0);
+        all.insert(0, range("loss", "worst", 0, largest));
         all
     }
 
@@ -235,7 +237,7 @@ impl Sizes {
             if self.alpha_and_depth { 5 } else { 3 + errors * (1 + u64::from(self.with_edges)) };
         add(Section::Renderer, "image and image gradient", "pixel gradient", 4 * channels * pixels);
         let scratch = self.ranges().iter().map(|range| range.at + range.bytes).max();
-        add(Section::Renderer, "sorts, loss, row gradients", SCRATCH, scratch.unwrap_or(0));
+        add(Section::Renderer, "sorts and loss", SCRATCH, scratch.unwrap_or(0));
         add(Section::Renderer, "loss", "tile sums", 8 * tiles);
         if self.with_error {
             add(Section::Renderer, "loss", "error", 4 * pixels);
@@ -348,7 +350,7 @@ mod tests {
         let cas = Accumulation::SubgroupCas;
         let found = [(4, Storage::default()), (4, both8), (1, smallest)]
             .map(|(pairs, storage)| bytes_per_row(pairs, storage, cas));
-        assert_eq!(found, [1069, 717, 598]);
+        assert_eq!(found, [1047, 695, 575]);
         // Records, the rows of slots, and the slots of rows.
         let in_slots = bytes_per_row(4, Storage::default(), Accumulation::Slots);
         assert_eq!(in_slots - found[0], 4 * (40 + 4) + 8);
