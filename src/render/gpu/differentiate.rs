@@ -69,17 +69,16 @@ impl Differentiable for GpuBackend {
             self.rebuild()?;
         }
         self.fit_image(camera.width, camera.height)?;
-        let channel = |c: usize| upstream.rgb.iter().skip(c).step_by(3).copied();
-        let planes = (0..3).flat_map(channel).chain(upstream.alpha.iter().copied());
-        let planes: Vec<f32> = planes.chain(upstream.depth.iter().copied()).collect();
-        self.write("pixel gradient", bytemuck::cast_slice(&planes));
+        let pixels = upstream.rgb.as_chunks::<3>().0.iter().zip(&upstream.alpha).zip(&upstream.depth);
+        let gradient = pixels.map(|((&[r, g, b], &a), &z)| [r, g, b, z, a, 0.0, 0.0, 0.0]);
+        self.write("pixel gradient", bytemuck::cast_slice(&gradient.collect::<Vec<_>>()));
         let frame = self.frame(camera, background, sh_degree);
         self.run(&frame, |passes, to| {
             passes.forward(to);
             passes.backward(to);
             passes.differentiate(to);
         })?;
-        let rendering = self.rendering(camera.width, camera.height)?;
+        let rendering = self.rendering(camera.width, camera.height, false)?;
         Ok((rendering, self.model_gradient(frame.model[1] as u8)?))
     }
 
@@ -105,10 +104,9 @@ impl Differentiable for GpuBackend {
         };
         // Without a forward pass nothing resets the state, and that of the last view could report too few bands.
         self.write("state", bytemuck::bytes_of(&<State as bytemuck::Zeroable>::zeroed()));
-        let (state, _) = self.run(&frame, |passes, to| passes.loss(to, [[0.0; 2]; 2]))?;
-        let planes = self.read("pixel gradient", 0, 12 * pixels.len() as u64)?;
-        let n = pixels.len();
-        let gradient = (0..3 * n).map(|i| planes[i % 3 * n + i / 3]).collect();
-        Ok((state.output(), gradient))
+        let (state, _) = self.run(&frame, |passes, to| passes.loss(to, false, true))?;
+        let gradient = self.read("canvas", 0, 16 * pixels.len() as u64)?;
+        let gradient = gradient.as_chunks::<4>().0.iter().flat_map(|[r, g, b, _]| [*r, *g, *b]);
+        Ok((state.output(), gradient.collect()))
     }
 }

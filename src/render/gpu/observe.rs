@@ -100,11 +100,9 @@ impl GpuBackend {
         let finish = self.read("finish", 0, 8 * pixels as u64)?;
         let error: Vec<f32> = match request.error {
             ErrorMode::Gradient => {
-                let planes = self.read("pixel gradient", 0, 12 * pixels as u64)?;
-                let square = |i: usize| planes[i] * planes[i];
-                (0..pixels)
-                    .map(|i| (square(i) + square(pixels + i) + square(2 * pixels + i)).sqrt())
-                    .collect()
+                let gradient = self.read("canvas", 0, 16 * pixels as u64)?;
+                let colours = gradient.as_chunks::<4>().0.iter();
+                colours.map(|[r, g, b, _]| (r * r + g * g + b * b).sqrt()).collect()
             }
             ErrorMode::L1 | ErrorMode::L1Dssim => self.read("error", 0, 4 * pixels as u64)?,
         };
@@ -169,10 +167,10 @@ impl GpuBackend {
             if exposure.is_some() {
                 passes.expose(to, camera.width * camera.height);
             }
-            passes.loss(to, [[0.0; 2]; 2]);
+            passes.loss(to, exposure.is_some(), false);
         })?;
         let loss = state.output().loss;
-        let image = self.rendering(camera.width, camera.height)?;
+        let image = self.rendering(camera.width, camera.height, exposure.is_some())?;
         let photograph = Photograph { target, background, exposure };
         let rendered = RenderedView { frame, shape, photograph };
         let points = if request.points == 0 {
@@ -185,7 +183,7 @@ impl GpuBackend {
             Vec::new()
         } else {
             let map = pixel_map(image.rgb.as_chunks::<3>().0, target, background, request.map);
-            self.write("pixel gradient", bytemuck::cast_slice(&map));
+            self.write("canvas", bytemuck::cast_slice(&map));
             self.continue_view(shape, |passes, to| {
                 passes.columns(to);
             });

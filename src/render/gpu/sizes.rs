@@ -172,6 +172,11 @@ impl Sizes {
         }
     }
 
+    /// The buffer with the gradients of pixels: the loss replaces the image.
+    pub(super) fn pixel_gradient(&self) -> &'static str {
+        if self.alpha_and_depth { "pixel gradient" } else { "canvas" }
+    }
+
     /// The arrays that hold the model.
     pub(super) fn parameters(&self) -> Vec<RowArray> {
         let mut arrays = self.row_arrays();
@@ -193,7 +198,7 @@ impl Sizes {
             .map(|(i, name)| range("entries", name, i * numbers, 4 * self.cap))
             .collect();
         let (width, height) = self.image;
-        all.push(range("loss", "derivatives", 0, 36 * u64::from(width) * u64::from(height)));
+        all.push(range("loss", "derivatives", 0, 12 * u64::from(width) * u64::from(height)));
         // As long as the longest of the others, which a kernel can bind.
         let largest = all.iter().map(|range| range.bytes).max().unwrap_or(0);
         all.insert(0, range("loss", "worst", 0, largest));
@@ -232,10 +237,12 @@ impl Sizes {
         add(Section::Tiles, "tiles", "tile counts", 4 * tiles);
         add(Section::Renderer, "image and image gradient", "canvas", 16 * pixels);
         add(Section::Renderer, "image and image gradient", "finish", 8 * pixels);
-        let errors = u64::from(self.records.has(Field::Error));
-        let channels =
-            if self.alpha_and_depth { 5 } else { 3 + errors * (1 + u64::from(self.with_edges)) };
-        add(Section::Renderer, "image and image gradient", "pixel gradient", 4 * channels * pixels);
+        if self.alpha_and_depth {
+            add(Section::Renderer, "image and image gradient", "pixel gradient", 32 * pixels);
+        }
+        if self.with_edges {
+            add(Section::Renderer, "loss", "edges", 4 * pixels);
+        }
         let scratch = self.ranges().iter().map(|range| range.at + range.bytes).max();
         add(Section::Renderer, "sorts and loss", SCRATCH, scratch.unwrap_or(0));
         add(Section::Renderer, "loss", "tile sums", 8 * tiles);
@@ -246,6 +253,7 @@ impl Sizes {
         // placeholder can stand in for only one of the two.
         add(Section::Renderer, "small buffers", "exposure", exposure::TRANSFORM);
         if self.exposures {
+            add(Section::Renderer, "exposure", "exposed", 16 * pixels);
             let sums = exposure::SUMS * exposure::groups(pixels);
             add(Section::Renderer, "exposure", "exposure sums", sums);
             add(Section::Renderer, "exposure", "exposure total", exposure::SUMS);
@@ -350,7 +358,7 @@ mod tests {
         let cas = Accumulation::SubgroupCas;
         let found = [(4, Storage::default()), (4, both8), (1, smallest)]
             .map(|(pairs, storage)| bytes_per_row(pairs, storage, cas));
-        assert_eq!(found, [1047, 695, 575]);
+        assert_eq!(found, [1018, 666, 518]);
         // Records, the rows of slots, and the slots of rows.
         let in_slots = bytes_per_row(4, Storage::default(), Accumulation::Slots);
         assert_eq!(in_slots - found[0], 4 * (40 + 4) + 8);
