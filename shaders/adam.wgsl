@@ -14,8 +14,9 @@
 // Each row's ages, its numbers of optimiser steps, in the halves of a word. Lower half: the age of all parameters but
 // bands 1-3; upper half: that of bands 1-3, if they have a schedule of their own.
 @group(0) @binding(6) var<storage, read_write> ages: array<u32>;
-// See project_bwd.wgsl.
-@group(0) @binding(7) var<storage, read> gradient: array<vec4<f32>>;
+// The derivatives that project_bwd.wgsl has left; see record.wgsl.
+@group(0) @binding(7) var<storage, read> row_sums: array<f32>;
+@group(0) @binding(10) var<storage, read> splats: array<vec4<f32>>;
 // 1/(1 − β₁^age) and √(1/(1 − β₂^age)).
 @group(0) @binding(8) var<storage, read> bias: array<vec2<f32>>;
 
@@ -114,13 +115,18 @@ fn adam_band(@builtin(global_invocation_id) id: vec3<u32>) {
     let has_rest_age = is_rest && is_set(REST_AGES);
     let age = next_age(select(ages[own] & 0xffffu, ages[own] >> 16u, has_rest_age));
     let correction = bias[min(age, MATURE)];
-    let d = gradient[5u * own + 4u].xyz;
-    let by_colour = gradient[5u * own + 3u];
+    let at = RECORD * row;
+    let to = at + DIRECTION_AT;
+    let d = vec3(row_sums[to], row_sums[to + 1u], row_sums[to + 2u]);
+    let unclamped = u32(row_sums[at + UNCLAMPED_AT]);
     var g = vec2(0.0);
     for (var p = 0u; p < 2u; p++) {
         let number = 2u * j + p;
         if number < width {
-            let by_number = basis_of(launch.a + number / 3u, d) * by_colour[number % 3u];
+            let channel = number % 3u;
+            let by_sum = row_sums[at + COLOUR_AT + channel];
+            let by_colour = select(0.0, by_sum, ((unclamped >> channel) & 1u) != 0u);
+            let by_number = basis_of(launch.a + number / 3u, d) * by_colour;
             g[p] = take_gradient(own * width + number, by_number, steps, waited);
         }
     }
@@ -171,7 +177,7 @@ fn adam_geometry(@builtin(global_invocation_id) id: vec3<u32>) {
         for (var p = 0u; p < 2u; p++) {
             let k = 2u * j + p;
             if k < 11u {
-                let by_number = gradient[5u * own + k / 4u][k % 4u] + add[k];
+                let by_number = splats[3u * row + k / 4u][k % 4u] + add[k];
                 g[p] = take_gradient(12u * own + k, by_number, steps, waited);
             }
         }

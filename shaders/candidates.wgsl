@@ -89,7 +89,7 @@ fn closest_approach(row: u32, at: vec2<f32>) -> vec4<f32> {
 
 // Bits of the final transmittance, and the index at which the pixel stopped.
 @group(0) @binding(9) var<storage, read> finish: array<vec2<u32>>;
-// The error per pixel, or three planes of its gradient.
+// The error per pixel, or the gradient in four numbers per pixel, the last unused.
 @group(0) @binding(10) var<storage, read> map: array<f32>;
 // The known leading digits of the smallest error to be selected; the number of pixels still to be selected among
 // those whose errors begin with these digits; the number of pixels written. Then a histogram of the next digit.
@@ -106,14 +106,15 @@ var<workgroup> counts: array<atomic<u32>, 256>;
 // Bits of a pixel's error, which sort like the errors; 0 for a pixel that cannot be a candidate.
 // launch.c: bits of the smallest alpha allowed, launch.d: 1 if the map is the gradient.
 fn key_of(pixel: u32) -> u32 {
-    let size = frame.image.x * frame.image.y;
-    if pixel >= size || !(1.0 - bitcast<f32>(finish[pixel].x) >= bitcast<f32>(launch.c)) {
+    if pixel >= frame.image.x * frame.image.y || !(1.0 - bitcast<f32>(finish[pixel].x) >= bitcast<f32>(launch.c)) {
         return 0u;
     }
-    var error = map[pixel];
+    var error = 0.0;
     if launch.d == 1u {
-        let g = vec3(error, map[size + pixel], map[2u * size + pixel]);
+        let g = vec3(map[4u * pixel], map[4u * pixel + 1u], map[4u * pixel + 2u]);
         error = sqrt(g.x * g.x + g.y * g.y + g.z * g.z);
+    } else {
+        error = map[pixel];
     }
     return select(0u, bitcast<u32>(error), error > 0.0);
 }

@@ -7,8 +7,8 @@
 @group(0) @binding(2) var<storage, read_write> canvas: array<vec4<f32>>;
 // See rasterize.wgsl.
 @group(0) @binding(3) var<storage, read> finish: array<vec2<u32>>;
-// dL/dpixel: three planes.
-@group(0) @binding(4) var<storage, read_write> gradient: array<f32>;
+// The image with the exposure, which the loss replaces by dL/dpixel; w: as in the canvas.
+@group(0) @binding(4) var<storage, read_write> exposed: array<vec4<f32>>;
 // Sums of each group, in four vectors: per channel the derivatives times red, green and blue, and the
 // derivatives alone; then, per channel, the derivatives times the transmittance.
 @group(0) @binding(5) var<storage, read_write> exposure_sums: array<vec4<f32>>;
@@ -20,17 +20,18 @@ const ADDERS: u32 = 64u;
 
 var<workgroup> reduced: array<mat4x4<f32>, ADDERS>;
 
+fn exposed_colour(rendered: vec3<f32>) -> vec3<f32> {
+    let colour = vec4(rendered, 1.0);
+    return vec3(dot(exposure[0], colour), dot(exposure[1], colour), dot(exposure[2], colour));
+}
+
 // Applies the photograph's exposure to the image.
 @compute @workgroup_size(256)
 fn expose(@builtin(global_invocation_id) id: vec3<u32>) {
     let at = index_of(id);
-    if at >= frame.image.x * frame.image.y {
-        return;
+    if at < frame.image.x * frame.image.y {
+        exposed[at] = vec4(exposed_colour(canvas[at].xyz), canvas[at].w);
     }
-    let colour = vec4(canvas[at].xyz, 1.0);
-    let exposed =
-        vec3(dot(exposure[0], colour), dot(exposure[1], colour), dot(exposure[2], colour));
-    canvas[at] = vec4(exposed, canvas[at].w);
 }
 
 // The sum of `reduced`; valid in the first invocation.
@@ -45,7 +46,7 @@ fn reduced_sum(lane: u32) -> mat4x4<f32> {
     return reduced[0];
 }
 
-// Computes dL/dpixel of the image before the exposure, and the sums of the group.
+// Replaces the image before the exposure by dL/dpixel, and computes the sums of the group.
 @compute @workgroup_size(64)
 fn expose_bwd(
     @builtin(workgroup_id) id: vec3<u32>,
@@ -57,14 +58,12 @@ fn expose_bwd(
     for (var k = 0u; k < GROUP / ADDERS; k++) {
         let at = group * GROUP + k * ADDERS + lane;
         if at < size {
-            let g = vec3(gradient[at], gradient[size + at], gradient[2u * size + at]);
-            let colour = vec4(canvas[at].xyz, 1.0);
+            let g = exposed[at].xyz;
+            let colour = vec4(exposed_colour(canvas[at].xyz), 1.0);
             let light = bitcast<f32>(finish[at].x);
             sums += mat4x4(g.x * colour, g.y * colour, g.z * colour, vec4(g * light, 0.0));
             let back = g.x * exposure[0].xyz + g.y * exposure[1].xyz + g.z * exposure[2].xyz;
-            gradient[at] = back.x;
-            gradient[size + at] = back.y;
-            gradient[2u * size + at] = back.z;
+            canvas[at] = vec4(back, exposed[at].w);
         }
     }
     reduced[lane] = sums;

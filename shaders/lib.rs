@@ -152,7 +152,7 @@ pub const STAGES: &[Stage] = &[
         .with(&[Numbers::Rows, Numbers::Colours]),
     stage("mask", On::All, &[VIEW, STEPS, shader!("mask")])
         .with(&[Numbers::Rows, Numbers::StoreRows]),
-    stage("adam", On::All, &[VIEW, RANDOM, STEPS, shader!("adam")]).with(&[
+    stage("adam", On::All, &[VIEW, RANDOM, RECORD, STEPS, shader!("adam")]).with(&[
         Numbers::Rows,
         Numbers::StoreRows,
         Numbers::Steps,

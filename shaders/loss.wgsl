@@ -1,20 +1,24 @@
-// Stage 4: 0.8·L1 + 0.2·(1 − SSIM) and its gradient, one tile per group, as in src/render/cpu/loss/.
+// Stage 4: 0.8·L1 + 0.2·(1 − SSIM) and its gradient, one tile per group and one channel per launch, as in
+// src/render/cpu/loss/.
 // SSIM is rewritten, exactly, in terms of e = x − y, the difference of rendering x and target y, and of the
 // mean of x·y, from which the sum of both variances follows. The 11×11 window is separable; pixels outside the image
-// are zero. An invocation sums eight neighbouring windows at once, which together read 18 values instead of 8 × 11,
-// since reading costs more than adding.
+// are zero. An invocation sums neighbouring windows at once, eight below or four beside one another: eight together read
+// 18 values instead of 8 × 11, and reading costs more than adding.
+//
+// launch.a: the channel.
 
 @group(0) @binding(1) var<storage, read_write> state: State;
-@group(0) @binding(2) var<storage, read> canvas: array<vec4<f32>>;
+// The image. dL/dpixel replaces it, channel by channel; each pixel's error for the row scores, if requested, replaces the
+// depth.
+@group(0) @binding(2) var<storage, read_write> canvas: array<vec4<f32>>;
 // Red, green, blue, alpha, a byte each.
 @group(0) @binding(3) var<storage, read> truth: array<u32>;
 // Weights of the pixels, one byte each.
 @group(0) @binding(4) var<storage, read> mask: array<u32>;
-// Derivatives of SSIM with respect to the window's means of e, e² and e·y, per channel: nine planes.
+// Derivatives of SSIM with respect to the window's means of e, e² and e·y in this channel: three planes.
 @group(0) @binding(5) var<storage, read_write> derivatives: array<f32>;
-// dL/dpixel: three planes; then each pixel's error for the row scores, if requested, and its edge
-// weight, if used.
-@group(0) @binding(6) var<storage, read_write> gradient: array<f32>;
+// The weights of pixels at edges in the row scores, if used.
+@group(0) @binding(6) var<storage, read> edges: array<f32>;
 // Sums of |e| and of SSIM per tile.
 @group(0) @binding(7) var<storage, read_write> tile_sums: array<vec2<f32>>;
 // Error per pixel, if candidates are requested.
@@ -36,15 +40,27 @@ const WITH_ERROR: u32 = 4u;
 const BY_PIXEL: u32 = 8u;
 const EXPOSED: u32 = 16u;
 
-// Weights of value k (of 18) in the eight windows centred on values 5 to 12, computed from the weights of
-// value k − 1: this reads the table once instead of eight times.
-fn next_weights(before: mat2x4<f32>, k: u32) -> mat2x4<f32> {
+// Number of invocations of a tile.
+const MEMBERS: u32 = 64u;
+
+// The weight of value k in the window centred on value 5.
+fn of_first(k: u32) -> f32 {
     var weights = array<f32, 11>(
         0.0010283802, 0.007598758, 0.036000773, 0.10936069, 0.21300553, 0.26601174,
         0.21300553, 0.10936069, 0.036000773, 0.007598758, 0.0010283802,
     );
-    let of_first = select(0.0, weights[min(k, 10u)], k <= 10u);
-    return mat2x4(vec4(of_first, before[0].xyz), vec4(before[0].w, before[1].xyz));
+    return select(0.0, weights[min(k, 10u)], k <= 10u);
+}
+
+// Weights of value k (of 18) in the eight windows centred on values 5 to 12, computed from the weights of
+// value k − 1: this reads the table once instead of eight times.
+fn next_of_eight(before: mat2x4<f32>, k: u32) -> mat2x4<f32> {
+    return mat2x4(vec4(of_first(k), before[0].xyz), vec4(before[0].w, before[1].xyz));
+}
+
+// The same for value k (of 14) in four windows.
+fn next_of_four(before: vec4<f32>, k: u32) -> vec4<f32> {
+    return vec4(of_first(k), before.xyz);
 }
 
 fn weight_of(at: u32) -> f32 {
@@ -77,34 +93,34 @@ fn difference(pixel: vec2<i32>, channel: u32) -> vec2<f32> {
     return vec2((canvas[at][channel] - target_value) * weight_of(at), target_value);
 }
 
-// Values read by eight neighbouring windows.
-const SPAN: u32 = 18u;
-// Numbers of runs of eight windows in the columns of a tile with its margin, and in the lines of the tile.
+// Values read by eight and by four neighbouring windows.
+const SPAN_OF_EIGHT: u32 = 18u;
+const SPAN_OF_FOUR: u32 = 14u;
+// Number of runs of eight windows in the columns of a tile with its margin.
 const COLUMNS: u32 = SIDE * TILE / 8u;
-const LINES: u32 = TILE * TILE / 8u;
 
 // A tile with its margin: two values per pixel. Then up to four sums over columns per pixel.
 var<workgroup> around: array<vec2<f32>, 676>;
 var<workgroup> rows: array<vec4<f32>, 416>;
-var<workgroup> reduced: array<vec2<f32>, GROUP>;
+var<workgroup> reduced: array<vec2<f32>, MEMBERS>;
 
-// Eight neighbouring pixels of a tile in the same line.
-struct Eight {
-    // Column of the first, and their line, relative to the tile's corner [px].
-    column: u32,
-    line: u32,
-    // Index of the first in the image, and how many are inside the image.
+// The four neighbouring pixels of an invocation, in one line of a tile.
+struct Four {
+    // Coordinates of the first in the image [px].
+    pixel: vec2<u32>,
+    // Index of the first in `rows`, and in the image.
+    first: u32,
     place: u32,
+    // How many are inside the image.
     inside: u32,
 }
 
-fn eight_of(corner: vec2<u32>, i: u32) -> Eight {
-    let column = 8u * (i % 2u);
-    let line = i / 2u;
-    let x = corner.x + column;
-    let y = corner.y + line;
-    let there = select(0u, min(frame.image.x - x, 8u), x < frame.image.x && y < frame.image.y);
-    return Eight(column, line, y * frame.image.x + x, there);
+fn four_of(corner: vec2<u32>, lane: u32) -> Four {
+    let within = vec2(4u * (lane % 4u), lane / 4u);
+    let pixel = corner + within;
+    let is_there = all(pixel < frame.image.xy);
+    let inside = select(0u, min(frame.image.x - pixel.x, 4u), is_there);
+    return Four(pixel, within.y * SIDE + within.x, pixel.y * frame.image.x + pixel.x, inside);
 }
 
 // Coordinates of pixel i of a tile with its margin; the pixel may be outside the image.
@@ -136,6 +152,18 @@ fn store_eight(
 ) {
     store_four(first, a[0], b[0], c[0], d[0]);
     store_four(first + 4u * SIDE, a[1], b[1], c[1], d[1]);
+}
+
+// The sums of an invocation's four windows, from the sums over columns.
+fn sums_of_four(first: u32) -> mat4x4<f32> {
+    var sums = mat4x4<f32>();
+    var w = vec4(0.0);
+    for (var k = 0u; k < SPAN_OF_FOUR; k++) {
+        w = next_of_four(w, k);
+        let here = rows[first + k];
+        sums += mat4x4(w * here.x, w * here.y, w * here.z, w * here.w);
+    }
+    return sums;
 }
 
 // SSIM at four pixels, and its derivatives with respect to the window's means.
@@ -170,9 +198,22 @@ fn ssim_of(
     );
 }
 
-// Computes SSIM, its derivatives, and the sums of the tile. Bits of the weights of |e| and of 1 − SSIM: in the
-// pixel's error (launch.a, launch.b) and in its error for row scores (launch.c, launch.d).
-@compute @workgroup_size(256)
+// Adds a channel's |e| and 1 − SSIM to the pixel's errors: for candidates, and for row scores.
+fn add_errors(at: u32, abs_e: f32, dissimilarity: f32) {
+    let is_first = launch.a == 0u;
+    if (frame.draw.w & WITH_ERROR) != 0u {
+        let here = abs_e * frame.errors.x + dissimilarity * frame.errors.y;
+        let sum = select(error[at], 0.0, is_first) + here;
+        error[at] = select(sum, sum * (1.0 / 3.0), launch.a == 2u);
+    }
+    if (frame.draw.w & BY_PIXEL) != 0u {
+        let here = abs_e * frame.errors.z + dissimilarity * frame.errors.w;
+        canvas[at].w = select(canvas[at].w, 0.0, is_first) + here;
+    }
+}
+
+// Computes SSIM, its derivatives, and the sums of the tile.
+@compute @workgroup_size(64)
 fn similarity(
     @builtin(workgroup_id) id: vec3<u32>,
     @builtin(local_invocation_index) lane: u32,
@@ -183,109 +224,67 @@ fn similarity(
     }
     let corner = corner_of(tile);
     let size = frame.image.x * frame.image.y;
-    var sums = vec2(0.0);
-    var pixel_error = mat2x4<f32>();
-    var score_error = mat2x4<f32>();
-    for (var channel = 0u; channel < 3u; channel++) {
-        workgroupBarrier();
-        for (var i = lane; i < SIDE * SIDE; i += GROUP) {
-            around[i] = difference(pixel_around(corner, i), channel);
-        }
-        workgroupBarrier();
-        for (var i = lane; i < COLUMNS; i += GROUP) {
-            let first = first_of_run(i);
-            var e = mat2x4<f32>();
-            var y = mat2x4<f32>();
-            var ee = mat2x4<f32>();
-            var xy = mat2x4<f32>();
-            var w = mat2x4<f32>();
-            for (var k = 0u; k < SPAN; k++) {
-                w = next_weights(w, k);
-                let here = around[first + k * SIDE];
-                let we = w * here.x;
-                let wy = w * here.y;
-                e += we;
-                y += wy;
-                ee += we * here.x;
-                xy += wy * (here.x + here.y);
-            }
-            store_eight(first, e, y, ee, xy);
-        }
-        workgroupBarrier();
-        for (var i = lane; i < LINES; i += GROUP) {
-            let eight = eight_of(corner, i);
-            let first = eight.line * SIDE + eight.column;
-            var e = mat2x4<f32>();
-            var y = mat2x4<f32>();
-            var ee = mat2x4<f32>();
-            var xy = mat2x4<f32>();
-            var w = mat2x4<f32>();
-            for (var k = 0u; k < SPAN; k++) {
-                w = next_weights(w, k);
-                let here = rows[first + k];
-                e += w * here.x;
-                y += w * here.y;
-                ee += w * here.z;
-                xy += w * here.w;
-            }
-            for (var half = 0u; half < 2u; half++) {
-                let found = ssim_of(e[half], y[half], ee[half], xy[half]);
-                let n = 4u * half;
-                let centre = first + 5u * SIDE + 5u + n;
-                let abs_e = abs(vec4(
-                    around[centre].x,
-                    around[centre + 1u].x,
-                    around[centre + 2u].x,
-                    around[centre + 3u].x,
-                ));
-                let there = vec4(n, n + 1u, n + 2u, n + 3u) < vec4(eight.inside);
-                let counts = select(vec4(0.0), vec4(1.0), there);
-                sums += vec2(dot(counts, abs_e), dot(counts, found.ssim));
-                pixel_error[half] +=
-                    abs_e * bitcast<f32>(launch.a) + (1.0 - found.ssim) * bitcast<f32>(launch.b);
-                if (frame.draw.w & BY_PIXEL) != 0u {
-                    score_error[half] +=
-                        abs_e * bitcast<f32>(launch.c) + (1.0 - found.ssim) * bitcast<f32>(launch.d);
-                }
-                for (var p = 0u; p < 4u; p++) {
-                    if n + p < eight.inside {
-                        let to = 3u * channel * size + eight.place + n + p;
-                        derivatives[to] = found.by_e[p];
-                        derivatives[to + size] = found.by_ee[p];
-                        derivatives[to + 2u * size] = found.by_ey[p];
-                    }
-                }
-            }
-        }
+    for (var i = lane; i < SIDE * SIDE; i += MEMBERS) {
+        around[i] = difference(pixel_around(corner, i), launch.a);
     }
-    if lane < LINES && (frame.draw.w & WITH_ERROR) != 0u {
-        let eight = eight_of(corner, lane);
-        for (var p = 0u; p < eight.inside; p++) {
-            error[eight.place + p] = pixel_error[p / 4u][p % 4u] * (1.0 / 3.0);
+    workgroupBarrier();
+    if lane < COLUMNS {
+        let first = first_of_run(lane);
+        var e = mat2x4<f32>();
+        var y = mat2x4<f32>();
+        var ee = mat2x4<f32>();
+        var xy = mat2x4<f32>();
+        var w = mat2x4<f32>();
+        for (var k = 0u; k < SPAN_OF_EIGHT; k++) {
+            w = next_of_eight(w, k);
+            let here = around[first + k * SIDE];
+            let we = w * here.x;
+            let wy = w * here.y;
+            e += we;
+            y += wy;
+            ee += we * here.x;
+            xy += wy * (here.x + here.y);
         }
+        store_eight(first, e, y, ee, xy);
     }
-    if lane < LINES && (frame.draw.w & BY_PIXEL) != 0u {
-        let eight = eight_of(corner, lane);
-        for (var p = 0u; p < eight.inside; p++) {
-            let to = 3u * size + eight.place + p;
-            gradient[to] = score_contribution(score_error[p / 4u][p % 4u] * (1.0 / 3.0), to + size);
-        }
+    workgroupBarrier();
+    let four = four_of(corner, lane);
+    let sums = sums_of_four(four.first);
+    let found = ssim_of(sums[0], sums[1], sums[2], sums[3]);
+    let centre = four.first + 5u * SIDE + 5u;
+    let abs_e = abs(vec4(
+        around[centre].x,
+        around[centre + 1u].x,
+        around[centre + 2u].x,
+        around[centre + 3u].x,
+    ));
+    for (var p = 0u; p < four.inside; p++) {
+        let at = four.place + p;
+        derivatives[at] = found.by_e[p];
+        derivatives[at + size] = found.by_ee[p];
+        derivatives[at + 2u * size] = found.by_ey[p];
+        add_errors(at, abs_e[p], 1.0 - found.ssim[p]);
     }
-    reduced[lane] = sums;
+    let counts = select(vec4(0.0), vec4(1.0), vec4(0u, 1u, 2u, 3u) < vec4(four.inside));
+    reduced[lane] = vec2(dot(counts, abs_e), dot(counts, found.ssim));
     let of_tile = reduced_sum(lane);
     if lane == 0u {
-        tile_sums[tile] = of_tile;
+        if launch.a == 0u {
+            tile_sums[tile] = of_tile;
+        } else {
+            tile_sums[tile] += of_tile;
+        }
     }
 }
 
-// A pixel's contribution to row scores, from its error; `place`: index of its edge weight.
-fn score_contribution(error: f32, place: u32) -> f32 {
+// A pixel's contribution to row scores, from its error.
+fn score_contribution(error: f32, at: u32) -> f32 {
     var map = error;
     if frame.score.x != 1.0 {
         map = pow(max(error, 0.0), frame.score.x);
     }
     if frame.score.y > 0.0 {
-        map *= gradient[place];
+        map *= edges[at];
     }
     return map;
 }
@@ -293,7 +292,7 @@ fn score_contribution(error: f32, place: u32) -> f32 {
 // The sum of `reduced`; valid in the first invocation.
 fn reduced_sum(lane: u32) -> vec2<f32> {
     workgroupBarrier();
-    for (var half = GROUP / 2u; half > 0u; half /= 2u) {
+    for (var half = MEMBERS / 2u; half > 0u; half /= 2u) {
         if lane < half {
             reduced[lane] += reduced[lane + half];
         }
@@ -302,8 +301,8 @@ fn reduced_sum(lane: u32) -> vec2<f32> {
     return reduced[0];
 }
 
-// Computes dL/dpixel.
-@compute @workgroup_size(256)
+// Computes dL/dpixel. Of the image it reads only the pixels that it replaces.
+@compute @workgroup_size(64)
 fn pixel_gradient(
     @builtin(workgroup_id) id: vec3<u32>,
     @builtin(local_invocation_index) lane: u32,
@@ -312,67 +311,50 @@ fn pixel_gradient(
     if tile >= frame.image.w {
         return;
     }
+    let channel = launch.a;
     let corner = corner_of(tile);
     let size = frame.image.x * frame.image.y;
     let scale = 1.0 / (3.0 * f32(size));
-    for (var channel = 0u; channel < 3u; channel++) {
-        workgroupBarrier();
-        for (var i = lane; i < COLUMNS; i += GROUP) {
-            let first = first_of_run(i);
-            let top = pixel_around(corner, first);
-            var x = mat2x4<f32>();
-            var y = mat2x4<f32>();
-            var z = mat2x4<f32>();
-            var w = mat2x4<f32>();
-            for (var k = 0u; k < SPAN; k++) {
-                w = next_weights(w, k);
-                let at = top + vec2(0, i32(k));
-                if is_inside(at) {
-                    let source = 3u * channel * size + u32(at.y) * frame.image.x + u32(at.x);
-                    x += w * derivatives[source];
-                    y += w * derivatives[source + size];
-                    z += w * derivatives[source + 2u * size];
-                }
+    if lane < COLUMNS {
+        let first = first_of_run(lane);
+        let top = pixel_around(corner, first);
+        var x = mat2x4<f32>();
+        var y = mat2x4<f32>();
+        var z = mat2x4<f32>();
+        var w = mat2x4<f32>();
+        for (var k = 0u; k < SPAN_OF_EIGHT; k++) {
+            w = next_of_eight(w, k);
+            let at = top + vec2(0, i32(k));
+            if is_inside(at) {
+                let source = u32(at.y) * frame.image.x + u32(at.x);
+                x += w * derivatives[source];
+                y += w * derivatives[source + size];
+                z += w * derivatives[source + 2u * size];
             }
-            store_eight(first, x, y, z, mat2x4<f32>());
         }
-        workgroupBarrier();
-        for (var i = lane; i < LINES; i += GROUP) {
-            let eight = eight_of(corner, i);
-            let first = eight.line * SIDE + eight.column;
-            var x = mat2x4<f32>();
-            var y = mat2x4<f32>();
-            var z = mat2x4<f32>();
-            var w = mat2x4<f32>();
-            for (var k = 0u; k < SPAN; k++) {
-                w = next_weights(w, k);
-                let here = rows[first + k];
-                x += w * here.x;
-                y += w * here.y;
-                z += w * here.z;
-            }
-            let pixel = vec2<i32>(corner + vec2(eight.column, eight.line));
-            for (var n = 0u; n < 8u; n++) {
-                if n < eight.inside {
-                    let ey = difference(pixel + vec2(i32(n), 0), channel);
-                    let half = n / 4u;
-                    let p = n % 4u;
-                    let by_ssim = x[half][p] + 2.0 * ey.x * y[half][p] + ey.y * z[half][p];
-                    let g = (1.0 - SSIM_WEIGHT) * scale * sign(ey.x) - SSIM_WEIGHT * scale * by_ssim;
-                    // The loss is a function of e·mask, so the chain rule multiplies by the mask.
-                    let to = eight.place + n;
-                    gradient[channel * size + to] = g * weight_of(to);
-                }
-            }
+        store_eight(first, x, y, z, mat2x4<f32>());
+    }
+    workgroupBarrier();
+    let four = four_of(corner, lane);
+    let sums = sums_of_four(four.first);
+    for (var p = 0u; p < four.inside; p++) {
+        let ey = difference(vec2<i32>(four.pixel + vec2(p, 0u)), channel);
+        let by_ssim = sums[0][p] + 2.0 * ey.x * sums[1][p] + ey.y * sums[2][p];
+        let g = (1.0 - SSIM_WEIGHT) * scale * sign(ey.x) - SSIM_WEIGHT * scale * by_ssim;
+        // The loss is a function of e·mask, so the chain rule multiplies by the mask.
+        let to = four.place + p;
+        canvas[to][channel] = g * weight_of(to);
+        if channel == 2u && (frame.draw.w & BY_PIXEL) != 0u {
+            canvas[to].w = score_contribution(canvas[to].w * (1.0 / 3.0), to);
         }
     }
 }
 
 // Computes the mean |e| and the mean SSIM of the image; a single group.
-@compute @workgroup_size(256)
+@compute @workgroup_size(64)
 fn total(@builtin(local_invocation_index) lane: u32) {
     var sums = vec2(0.0);
-    for (var tile = lane; tile < frame.image.w; tile += GROUP) {
+    for (var tile = lane; tile < frame.image.w; tile += MEMBERS) {
         sums += tile_sums[tile];
     }
     reduced[lane] = sums;

@@ -7,8 +7,8 @@
 @group(0) @binding(3) var<storage, read_write> mask_offsets: array<f32>;
 @group(0) @binding(4) var<storage, read_write> mask_moments: array<f32>;
 @group(0) @binding(5) var<storage, read> ages: array<u32>;
-// See project_bwd.wgsl.
-@group(0) @binding(6) var<storage, read> gradient: array<vec4<f32>>;
+// The derivatives that project_bwd.wgsl has left; see record.wgsl.
+@group(0) @binding(6) var<storage, read> splats: array<vec4<f32>>;
 @group(0) @binding(7) var<storage, read> bias: array<vec2<f32>>;
 
 // Bits of: the initial logit of masks (launch.a), the step size (launch.b), the derivative of the loss term
@@ -22,8 +22,8 @@ fn step_masks(@builtin(global_invocation_id) id: vec3<u32>) {
     let own = row - frame.frozen.x;
     let start = bitcast<f32>(launch.a);
     var known = load_row(row);
-    let g_opacity = gradient[5u * own + 2u].z;
-    let g_scales = gradient[5u * own].w + gradient[5u * own + 1u].x + gradient[5u * own + 1u].y;
+    let g_opacity = splats[3u * row + 2u].z;
+    let g_scales = splats[3u * row].w + splats[3u * row + 1u].x + splats[3u * row + 1u].y;
     let by_factor = g_opacity / sigmoid(-known.logit) + g_scales;
     let m = start + mask_offsets[own];
     let g = (by_factor + bitcast<f32>(launch.c)) * sigmoid(m) * sigmoid(-m);

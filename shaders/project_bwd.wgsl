@@ -1,13 +1,11 @@
 // Stage 6: from splat gradients to parameter gradients, one row per invocation;
-// src/render/cpu/project_bwd.rs derives the formulas.
+// src/render/cpu/project_bwd.rs derives the formulas. The results replace the row's splat and sums, which the rest of
+// the step does not need (record.wgsl), so that gradients take no memory of their own.
 
 // Sums of the records, one record per row.
-@group(0) @binding(6) var<storage, read> row_sums: array<f32>;
+@group(0) @binding(6) var<storage, read_write> row_sums: array<f32>;
 @group(0) @binding(7) var<storage, read> depths: array<u32>;
-// Five vectors per row that is not frozen. Derivatives with respect to: mean, log-scale x | log-scale
-// y, z, quaternion w, x | quaternion y, z, logit, projected mean x | colour before its clamp,
-// projected mean y. Then the view direction, unused.
-@group(0) @binding(8) var<storage, read_write> gradient: array<vec4<f32>>;
+@group(0) @binding(8) var<storage, read_write> splats: array<vec4<f32>>;
 
 @compute @workgroup_size(256)
 fn project_bwd(@builtin(global_invocation_id) id: vec3<u32>) {
@@ -15,14 +13,16 @@ fn project_bwd(@builtin(global_invocation_id) id: vec3<u32>) {
     if i < frame.frozen.x || i >= frame.model.x {
         return;
     }
-    let to = 5u * (i - frame.frozen.x);
+    let at = i * RECORD;
     if depths[i] == NONE {
-        for (var k = 0u; k < 5u; k++) {
-            gradient[to + k] = vec4(0.0);
+        for (var k = 0u; k < 3u; k++) {
+            splats[3u * i + k] = vec4(0.0);
+        }
+        for (var k = 0u; k < BASE; k++) {
+            row_sums[at + k] = 0.0;
         }
         return;
     }
-    let at = i * RECORD;
     let row = load_row(i);
     let g = geometry(row);
     let factor = conic(g);
@@ -93,7 +93,8 @@ fn project_bwd(@builtin(global_invocation_id) id: vec3<u32>) {
     var y = basis(degree, d);
     let raw = raw_colour(i, degree, &y);
     let by_colour = vec3(row_sums[at + 6u], row_sums[at + 7u], row_sums[at + 8u]);
-    let dc = select(vec3(0.0), by_colour, raw > vec3(0.0));
+    let is_unclamped = raw > vec3(0.0);
+    let dc = select(vec3(0.0), by_colour, is_unclamped);
     let by_d = direction_gradient(i, degree, d, dc);
     let from_d = (by_d - dot(by_d, d) * d) * towards.w;
     let by_mean = r0 * dp.x + r1 * dp.y + r2 * dp.z + from_d;
@@ -101,11 +102,15 @@ fn project_bwd(@builtin(global_invocation_id) id: vec3<u32>) {
     // dα/d(logit) = α(1 − o); 1 − o = σ(−logit) keeps its precision near o = 1.
     let by_logit = q / (1.0 + exp_exact(row.logit));
 
-    gradient[to] = vec4(by_mean, by_log_scale.x);
-    gradient[to + 1u] = vec4(by_log_scale.yz, by_w, by_v.x);
-    gradient[to + 2u] = vec4(by_v.yz, by_logit, dm.x);
-    gradient[to + 3u] = vec4(dc, dm.y);
-    gradient[to + 4u] = vec4(d, 0.0);
+    row_sums[at + DIRECTION_AT] = d.x;
+    row_sums[at + DIRECTION_AT + 1u] = d.y;
+    row_sums[at + DIRECTION_AT + 2u] = d.z;
+    row_sums[at + MEAN_Y_AT] = dm.y;
+    row_sums[at + UNCLAMPED_AT] = dot(select(vec3(0.0), vec3(1.0, 2.0, 4.0), is_unclamped), vec3(1.0));
+    row_sums[at + L1_AT] = splats[3u * i].z;
+    splats[3u * i] = vec4(by_mean, by_log_scale.x);
+    splats[3u * i + 1u] = vec4(by_log_scale.yz, by_w, by_v.x);
+    splats[3u * i + 2u] = vec4(by_v.yz, by_logit, dm.x);
 }
 
 // The gradient through the factor of opacities with antialiasing: with respect to log-scales, to rotations about

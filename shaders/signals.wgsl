@@ -3,8 +3,7 @@
 
 @group(0) @binding(1) var<storage, read> state: State;
 @group(0) @binding(2) var<storage, read_write> signals: array<f32>;
-// See project_bwd.wgsl.
-@group(0) @binding(3) var<storage, read> gradient: array<vec4<f32>>;
+// The sums, and the derivatives that project_bwd.wgsl has left; see record.wgsl.
 @group(0) @binding(4) var<storage, read> row_sums: array<f32>;
 @group(0) @binding(5) var<storage, read> depths: array<u32>;
 @group(0) @binding(6) var<storage, read> splats: array<vec4<f32>>;
@@ -69,12 +68,12 @@ fn accumulate(@builtin(global_invocation_id) id: vec3<u32>) {
     if row < frame.frozen.x || row >= frame.model.x || state.short != 0u || depths[row] == NONE {
         return;
     }
-    let own = 5u * (row - frame.frozen.x);
-    let half = 0.5 * vec2<f32>(frame.image.xy);
-    let by_mean = gradient[own].xyz;
-    let by_projected = vec2(gradient[own + 2u].w, gradient[own + 3u].w);
     let at = row * RECORD;
-    let by_colour = vec3(row_sums[at + 6u], row_sums[at + 7u], row_sums[at + 8u]);
+    let half = 0.5 * vec2<f32>(frame.image.xy);
+    let by_mean = splats[3u * row].xyz;
+    let by_projected = vec2(splats[3u * row + 2u].w, row_sums[at + MEAN_Y_AT]);
+    let colour = at + COLOUR_AT;
+    let by_colour = vec3(row_sums[colour], row_sums[colour + 1u], row_sums[colour + 2u]);
     add(VISIBLE_COUNT, row, 1.0);
     let depth = bitcast<f32>(depths[row]);
     let full = frame.background.w;
@@ -91,7 +90,7 @@ fn accumulate(@builtin(global_invocation_id) id: vec3<u32>) {
     if ABS_X_AT > 0u {
         // The sums are of scaled values (see project_bwd.wgsl), and the first sum lacks its factor l1.
         let unscale = 1.0 / EXPONENT_SCALE;
-        let l1 = splats[3u * row].z * unscale;
+        let l1 = row_sums[at + L1_AT] * unscale;
         let by_x = l1 * unscale * row_sums[at + ABS_X_AT];
         let by_y = unscale * unscale * row_sums[at + ABS_Y_AT];
         add(SCREEN_GRADIENT_ABS, row, weight * norm2(vec2(by_x, by_y) * half));

@@ -2,9 +2,9 @@
 // src/render/cpu/rasterize_bwd.rs derives the sums.
 
 @group(0) @binding(6) var<storage, read> finish: array<vec2<u32>>;
-// Planes of dL/dpixel: red, green, blue, and, if MORE is set, alpha and depth. If MORE is not set, a plane of
-// the pixels' errors follows, provided that records have a sum of errors.
-@group(0) @binding(7) var<storage, read> pixel_gradient: array<f32>;
+// dL/dpixel: red, green, blue, then depth if MORE is set, or the pixel's error if records have a sum of errors. If MORE
+// is set, a second vector per pixel begins with alpha.
+@group(0) @binding(7) var<storage, read> pixel_gradient: array<vec4<f32>>;
 
 // True if alpha and depth have gradients.
 override MORE: bool = false;
@@ -27,24 +27,22 @@ struct BackwardPixels {
     stop: vec4<u32>,
 }
 
-fn plane(n: u32, quad: Quad) -> vec4<f32> {
-    let first = n * frame.image.x * frame.image.y;
-    var g = vec4(0.0);
+fn upstream(quad: Quad) -> Upstream {
+    var g = Upstream(vec4(0.0), vec4(0.0), vec4(0.0), vec4(0.0), vec4(0.0));
     for (var p = 0u; p < 4u; p++) {
         if quad.inside[p] {
-            g[p] = pixel_gradient[first + quad.place[p]];
+            let at = select(1u, 2u, MORE) * quad.place[p];
+            let here = pixel_gradient[at];
+            g.red[p] = here.x;
+            g.green[p] = here.y;
+            g.blue[p] = here.z;
+            if MORE || ERROR_AT > 0u {
+                g.map[p] = here.w;
+            }
+            if MORE {
+                g.alpha[p] = pixel_gradient[at + 1u].x;
+            }
         }
-    }
-    return g;
-}
-
-fn upstream(quad: Quad) -> Upstream {
-    var g = Upstream(plane(0u, quad), plane(1u, quad), plane(2u, quad), vec4(0.0), vec4(0.0));
-    if MORE {
-        g.alpha = plane(3u, quad);
-        g.map = plane(4u, quad);
-    } else if ERROR_AT > 0u {
-        g.map = plane(3u, quad);
     }
     return g;
 }

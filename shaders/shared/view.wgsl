@@ -25,6 +25,8 @@ struct Frame {
     // The combination of errors into a score: exponent of a pixel's error, weight of edges, exponents of
     // the sum of weights and of a view's score.
     score: vec4<f32>,
+    // Weights of |e| and of 1 − SSIM in the error of a pixel: for candidates, then for row scores.
+    errors: vec4<f32>,
     // Seed, step, flags of the optimiser (see adam.wgsl), flags of the loss (see loss.wgsl).
     draw: vec4<u32>,
     // Number of frozen rows: they come first, never change, and have no entries in the arrays used only

@@ -122,7 +122,9 @@ fn check_sizes(
         "records" | "list" | "keys 0" | "keys 1" | "values" | "row of slot" | "sums" | SCRATCH => {
             Fit::TileCap(most / bytes.div_ceil(sizes.cap).max(1))
         }
-        "canvas" | "finish" | "pixel gradient" | "derivatives" => Fit::ImageSize,
+        "canvas" | "finish" | "pixel gradient" | "exposed" | "edges" | "derivatives" => {
+            Fit::ImageSize
+        }
         _ => Fit::Budget(device.summary.largest_budget(sizes.sh_degree)),
     };
     Err(BackendError::BufferTooLarge {

@@ -11,28 +11,26 @@ use densify_core::image::Image8;
 use densify_core::sh;
 
 impl GpuBackend {
-    /// Reads the gradients that stages 5 and 6 have computed.
+    /// Reads the gradients that stages 5 and 6 have left; see `shaders/shared/record.wgsl`.
     fn model_gradient(&self, degree: u8) -> Result<ModelGradient, BackendError> {
         let n = self.rows as u64;
-        let gradient = self.read("gradient", 0, 80 * n)?;
         let sums = self.read("row sums", 0, 4 * RecordLayout::MOST as u64 * n)?;
-        let splats = self.read("splats", 0, 48 * n)?;
+        let gradient = self.read("splats", 0, 48 * n)?;
         let depths = self.read("depths", 0, 4 * n)?;
         let planes = 3 * sh_coefficients(self.sizes.sh_degree);
         let mut out = ModelGradient { sh: vec![0.0; planes * self.rows], ..Default::default() };
-        let rows =
-            gradient.as_chunks::<20>().0.iter().zip(sums.as_chunks::<{ RecordLayout::MOST }>().0);
-        let rest = splats.as_chunks::<12>().0.iter().zip(depths);
-        for (row, ((g, sums), (splat, depth))) in rows.zip(rest).enumerate() {
+        let rows = gradient.as_chunks::<12>().0.iter().zip(depths);
+        let sums = sums.as_chunks::<{ RecordLayout::MOST }>().0;
+        for (row, ((g, depth), sums)) in rows.zip(sums).enumerate() {
             let seen = depth.to_bits() != u32::MAX;
             let sums = if seen { *sums } else { [0.0; RecordLayout::MOST] };
-            let l1 = if seen { splat[2] } else { 0.0 };
+            let [dx, dy, dz, mean_y, unclamped, l1, ..] = sums;
             let unscale = 1.0 / EXPONENT_SCALE;
             out.means.push([g[0], g[1], g[2]]);
             out.log_scales.push([g[3], g[4], g[5]]);
             out.quats.push([g[6], g[7], g[8], g[9]]);
             out.opacity_logits.push(g[10]);
-            out.mean2d.push([g[11], g[15]]);
+            out.mean2d.push([g[11], mean_y]);
             let sum = |field: Field| sums[field.number()];
             out.mean2d_abs.push([
                 l1 * unscale * unscale * sum(Field::AbsX),
@@ -45,10 +43,10 @@ impl GpuBackend {
             out.visible.push(seen);
             let mut y = [0.0_f32; 16];
             y[0] = sh::C0;
-            sh::basis(degree, [g[16], g[17], g[18]], &mut y);
+            sh::basis(degree, [dx, dy, dz], &mut y);
             for (k, basis) in y.iter().enumerate().take(sh_coefficients(degree)) {
-                for channel in 0..3 {
-                    out.sh[row * planes + 3 * k + channel] = basis * g[12 + channel];
+                for channel in (0..3).filter(|channel| unclamped as u32 >> channel & 1 == 1) {
+                    out.sh[row * planes + 3 * k + channel] = basis * sums[6 + channel];
                 }
             }
         }
@@ -71,17 +69,16 @@ impl Differentiable for GpuBackend {
             self.rebuild()?;
         }
         self.fit_image(camera.width, camera.height)?;
-        let channel = |c: usize| upstream.rgb.iter().skip(c).step_by(3).copied();
-        let planes = (0..3).flat_map(channel).chain(upstream.alpha.iter().copied());
-        let planes: Vec<f32> = planes.chain(upstream.depth.iter().copied()).collect();
-        self.write("pixel gradient", bytemuck::cast_slice(&planes));
+        let pixels = upstream.rgb.as_chunks::<3>().0.iter().zip(&upstream.alpha).zip(&upstream.depth);
+        let gradient = pixels.map(|((&[r, g, b], &a), &z)| [r, g, b, z, a, 0.0, 0.0, 0.0]);
+        self.write("pixel gradient", bytemuck::cast_slice(&gradient.collect::<Vec<_>>()));
         let frame = self.frame(camera, background, sh_degree);
         self.run(&frame, |passes, to| {
             passes.forward(to);
             passes.backward(to);
             passes.differentiate(to);
         })?;
-        let rendering = self.rendering(camera.width, camera.height)?;
+        let rendering = self.rendering(camera.width, camera.height, false)?;
         Ok((rendering, self.model_gradient(frame.model[1] as u8)?))
     }
 
@@ -107,10 +104,9 @@ impl Differentiable for GpuBackend {
         };
         // Without a forward pass nothing resets the state, and that of the last view could report too few bands.
         self.write("state", bytemuck::bytes_of(&<State as bytemuck::Zeroable>::zeroed()));
-        let (state, _) = self.run(&frame, |passes, to| passes.loss(to, [[0.0; 2]; 2]))?;
-        let planes = self.read("pixel gradient", 0, 12 * pixels.len() as u64)?;
-        let n = pixels.len();
-        let gradient = (0..3 * n).map(|i| planes[i % 3 * n + i / 3]).collect();
-        Ok((state.output(), gradient))
+        let (state, _) = self.run(&frame, |passes, to| passes.loss(to, false, true))?;
+        let gradient = self.read("canvas", 0, 16 * pixels.len() as u64)?;
+        let gradient = gradient.as_chunks::<4>().0.iter().flat_map(|[r, g, b, _]| [*r, *g, *b]);
+        Ok((state.output(), gradient.collect()))
     }
 }

@@ -28,6 +28,7 @@ pub(super) struct Frame {
     pub(super) more_rates: [f32; 4],
     pub(super) noise: [f32; 4],
     pub(super) score: [f32; 4],
+    pub(super) errors: [f32; 4],
     pub(super) draw: [u32; 4],
     pub(super) frozen: [u32; 4],
     pub(super) planes: [[u32; 4]; 8],

@@ -12,10 +12,9 @@ use super::pipelines::{CompiledKernel, Pipelines};
 use super::rows::{Content, Edited, FIRST, MOMENTS, PARAMETERS, RowArray, SECOND, WAITING};
 use super::sizes::Sizes;
 use crate::{Accumulation, NumberKind};
-use densify_shaders::Formats;
 
 /// Sources of the error per pixel: the loss's error, or its gradient.
-const ERROR_MAPS: [&str; 2] = ["error", "pixel gradient"];
+const ERROR_MAPS: [&str; 2] = ["error", "canvas"];
 const KEYS: [&str; 2] = ["keys 0", "keys 1"];
 /// The sorted values end in the first, the lists.
 const VALUES: [&str; 2] = ["list", "values"];
@@ -128,7 +127,7 @@ impl<L> Launches<L> {
         bind: Bind<'_, L>,
         sizes: &Sizes,
     ) -> Self {
-        let rebound = rebound(sizes.formats());
+        let rebound = rebound(sizes);
         let launches = |kernel: &str| match rebound.get(base_name(kernel)) {
             None => vec![bind(kernel, &[])],
             Some(lists) => lists.iter().map(|rebindings| bind(kernel, rebindings)).collect(),
@@ -175,7 +174,8 @@ pub(super) fn base_name(kernel: &str) -> &str {
 
 /// The kernels with variables that are bound to buffers of other names, with the exceptions of each launch. Of two
 /// launches, the first reads `keys 0` or writes the lists.
-pub(super) fn rebound(formats: Formats) -> HashMap<&'static str, Vec<Vec<Rebinding>>> {
+pub(super) fn rebound(sizes: &Sizes) -> HashMap<&'static str, Vec<Vec<Rebinding>>> {
+    let formats = sizes.formats();
     let two = |rebindings: &dyn Fn(usize) -> Vec<Rebinding>| vec![rebindings(0), rebindings(1)];
     let scatter = |keys: usize, values: usize, values_to| {
         let from = [("keys in", KEYS[keys]), ("values in", VALUES[values])];
@@ -197,6 +197,8 @@ pub(super) fn rebound(formats: Formats) -> HashMap<&'static str, Vec<Vec<Rebindi
         let others = [("waiting", WAITING[part])].into_iter().chain(params);
         others.chain(moments(part)).collect()
     };
+    // Without and with an exposure.
+    let images = vec![vec![], vec![("canvas", "exposed")]];
     let keys_in = two(&|i| vec![("keys in", KEYS[i])]);
     HashMap::from([
         ("compact", vec![vec![("keys out", KEYS[0]), ("values out", VALUES[0])]]),
@@ -214,9 +216,9 @@ pub(super) fn rebound(formats: Formats) -> HashMap<&'static str, Vec<Vec<Rebindi
             ],
         ),
         ("emit_entries", two(&|i| vec![("keys out", KEYS[0]), ("values out", emitted(i))])),
-        ("similarity", vec![vec![("gradient", "pixel gradient")]]),
-        ("pixel_gradient", vec![vec![("gradient", "pixel gradient")]]),
-        ("expose_bwd", vec![vec![("gradient", "pixel gradient")]]),
+        ("similarity", images.clone()),
+        ("pixel_gradient", images),
+        ("rasterize_bwd", vec![vec![("pixel gradient", sizes.pixel_gradient())]]),
         ("adam_band", (0..4).map(|band| adam(1 + band)).collect()),
         ("adam_geometry", vec![adam(0)]),
         ("clamp_opacity", vec![moments(0)]),
@@ -225,9 +227,9 @@ pub(super) fn rebound(formats: Formats) -> HashMap<&'static str, Vec<Vec<Rebindi
         // Borrows the sums of the rows, which are unused before the backward pass.
         ("surface", vec![vec![("pixels", "ops"), ("points", "row sums")]]),
         ("count_errors", two(&|i| vec![("map", ERROR_MAPS[i])])),
-        ("narrow", vec![vec![("worst", "gradient")]]),
-        ("write_worst", two(&|i| vec![("map", ERROR_MAPS[i]), ("worst", "gradient")])),
-        ("replay", vec![vec![("map", "pixel gradient")]]),
+        ("write_worst", two(&|i| vec![("map", ERROR_MAPS[i])])),
+        // Borrows the canvas, which the host has read.
+        ("replay", vec![vec![("map", "canvas")]]),
         ("gather", vec![vec![("all records", "records")]]),
         ("gather_columns", vec![vec![("all records", "records")]]),
     ])

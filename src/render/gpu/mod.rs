@@ -320,7 +320,7 @@ impl Backend for GpuBackend {
         self.run(&frame, |passes, to| {
             passes.forward(to);
         })?;
-        self.rendering(camera.width, camera.height)
+        self.rendering(camera.width, camera.height, false)
     }
 
     fn inspect(&mut self) -> Result<&mut dyn Inspect, BackendError> {

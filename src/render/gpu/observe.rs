@@ -10,7 +10,6 @@ use densify_policies::policy::{
 use super::GpuBackend;
 use super::frame::Frame;
 use super::passes::{Search, Shape};
-use super::rows::GRADIENT;
 use super::sizes::OPS_BYTES;
 use crate::candidates::{Photograph, count_to_rank};
 use crate::cpu::EXPONENT_SCALE;
@@ -32,8 +31,10 @@ impl GpuBackend {
         count: usize,
         [width, height, ..]: [u32; 4],
     ) -> Option<Search> {
-        // The result, which begins with its length, borrows the range of the rows' gradients.
-        let room = (GRADIENT / 2 * self.sizes.trained() as usize - 1).min(u32::MAX as usize);
+        // The result begins with its length.
+        let ranges = self.sizes.ranges();
+        let bytes = ranges.iter().find(|range| range.name == "worst").map_or(0, |r| r.bytes);
+        let room = (bytes / 8).saturating_sub(1).min(u32::MAX.into()) as usize;
         let wanted = count_to_rank(count, request.spaced);
         (wanted <= room).then_some(Search {
             pixels: width * height,
@@ -74,13 +75,13 @@ impl GpuBackend {
     fn search_result(&self, search: &Search) -> Result<Option<Vec<(f32, u32)>>, BackendError> {
         // The pixels wanted, and a few whose errors equal that of the last one.
         let likely = (search.wanted + 63).min(search.room);
-        let mut read = self.read("gradient", 0, 8 * (1 + u64::from(likely)))?;
+        let mut read = self.read("worst", 0, 8 * (1 + u64::from(likely)))?;
         let count = read[0].to_bits();
         if count > search.room {
             return Ok(None);
         }
         if count > likely {
-            read = self.read("gradient", 0, 8 * (1 + u64::from(count)))?;
+            read = self.read("worst", 0, 8 * (1 + u64::from(count)))?;
         }
         let pairs = read.as_chunks::<2>().0[1..].iter().take(count as usize);
         Ok(Some(pairs.map(|[error, pixel]| (*error, pixel.to_bits())).collect()))
@@ -99,11 +100,9 @@ impl GpuBackend {
         let finish = self.read("finish", 0, 8 * pixels as u64)?;
         let error: Vec<f32> = match request.error {
             ErrorMode::Gradient => {
-                let planes = self.read("pixel gradient", 0, 12 * pixels as u64)?;
-                let square = |i: usize| planes[i] * planes[i];
-                (0..pixels)
-                    .map(|i| (square(i) + square(pixels + i) + square(2 * pixels + i)).sqrt())
-                    .collect()
+                let gradient = self.read("canvas", 0, 16 * pixels as u64)?;
+                let colours = gradient.as_chunks::<4>().0.iter();
+                colours.map(|[r, g, b, _]| (r * r + g * g + b * b).sqrt()).collect()
             }
             ErrorMode::L1 | ErrorMode::L1Dssim => self.read("error", 0, 4 * pixels as u64)?,
         };
@@ -168,10 +167,10 @@ impl GpuBackend {
             if exposure.is_some() {
                 passes.expose(to, camera.width * camera.height);
             }
-            passes.loss(to, [[0.0; 2]; 2]);
+            passes.loss(to, exposure.is_some(), false);
         })?;
         let loss = state.output().loss;
-        let image = self.rendering(camera.width, camera.height)?;
+        let image = self.rendering(camera.width, camera.height, exposure.is_some())?;
         let photograph = Photograph { target, background, exposure };
         let rendered = RenderedView { frame, shape, photograph };
         let points = if request.points == 0 {
@@ -184,7 +183,7 @@ impl GpuBackend {
             Vec::new()
         } else {
             let map = pixel_map(image.rgb.as_chunks::<3>().0, target, background, request.map);
-            self.write("pixel gradient", bytemuck::cast_slice(&map));
+            self.write("canvas", bytemuck::cast_slice(&map));
             self.continue_view(shape, |passes, to| {
                 passes.columns(to);
             });

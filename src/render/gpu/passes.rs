@@ -201,26 +201,30 @@ impl Passes<'_> {
         to.run(l.nth("find_tiles", is_odd(digits)), [0; 4], groups);
     }
 
-    /// Applies the photograph's exposure to the rendered image.
+    /// Applies the photograph's exposure to a copy of the rendered image.
     pub(super) fn expose(&self, to: &mut Recorder<'_>, pixels: u32) {
         to.run(self.launches.get("expose"), [0; 4], groups(pixels.into()) as u32);
     }
 
-    /// Backpropagates the gradients of an exposed image, and sums the derivatives with respect to the exposure.
+    /// Backpropagates the gradients of an exposed image to the canvas, and sums the derivatives with respect to the
+    /// exposure.
     pub(super) fn expose_bwd(&self, to: &mut Recorder<'_>, pixels: u32) {
         let l = self.launches;
         to.run(l.get("expose_bwd"), [0; 4], groups(pixels.into()) as u32);
         to.run(l.get("total_exposure"), [0; 4], 1);
     }
 
-    /// Stage 4. `error_weights`: the weights of |e| and of 1 − SSIM in the error of a pixel, first for candidates, then
-    /// for signals.
-    pub(super) fn loss(&self, to: &mut Recorder<'_>, error_weights: [[f32; 2]; 2]) {
+    /// Stage 4 of an image with or without an exposure. If `differentiates`, dL/dpixel replaces the image.
+    pub(super) fn loss(&self, to: &mut Recorder<'_>, is_exposed: bool, differentiates: bool) {
         let l = self.launches;
-        let [[a, b], [c, d]] = error_weights.map(|weights| weights.map(f32::to_bits));
+        let image = usize::from(is_exposed);
         to.stage("loss");
-        to.run(l.get("similarity"), [a, b, c, d], self.shape.tiles);
-        to.run(l.get("pixel_gradient"), [0; 4], self.shape.tiles);
+        for channel in 0..3 {
+            to.run(l.nth("similarity", image), [channel, 0, 0, 0], self.shape.tiles);
+            if differentiates {
+                to.run(l.nth("pixel_gradient", image), [channel, 0, 0, 0], self.shape.tiles);
+            }
+        }
         to.run(l.get("total"), [0; 4], 1);
     }
 
@@ -280,8 +284,8 @@ impl Passes<'_> {
         to.run(l.get("adam_geometry"), [0; 4], groups);
     }
 
-    /// Writes the pixels with the largest errors to the range of the rows' gradients: their number, then the error
-    /// bits and the index of each, as many as fit. Pixels whose error equals that of the last one wanted are included.
+    /// Writes the pixels with the largest errors to the range "worst": their number, then the error bits and the index
+    /// of each, as many as fit. Pixels whose error equals that of the last one wanted are included.
     pub(super) fn worst(&self, to: &mut Recorder<'_>, search: &Search) {
         let l = self.launches;
         let &Search { pixels, wanted, room, min_alpha, of_gradient } = search;

@@ -34,8 +34,6 @@ pub(super) const WAITING: PartNames =
 const GEOMETRY: usize = 12;
 /// Words per row of the geometry if all but the means take 16 bits.
 const NARROW_GEOMETRY: usize = 7;
-/// Numbers per row of the gradients; see `shaders/project_bwd.wgsl`.
-pub(super) const GRADIENT: usize = 20;
 
 /// The content of an array.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -259,5 +257,5 @@ pub(super) fn row_arrays(
 /// Bytes per row of the widest array for models of this SH degree, for any policy.
 pub(super) fn widest_row(sh_degree: u8) -> u64 {
     let arrays = row_arrays(sh_degree, [false; 2], Narrow::default(), [0; 5]);
-    arrays.iter().map(RowArray::row_bytes).max().unwrap_or(0).max(4 * GRADIENT as u64)
+    arrays.iter().map(RowArray::row_bytes).max().unwrap_or(0)
 }

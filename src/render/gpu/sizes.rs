@@ -5,7 +5,7 @@ use wgpu::BufferUsages;
 
 use super::exposure;
 use super::frame::{Frame, State, grid};
-use super::rows::{Content, GRADIENT, Narrow, RowArray, row_arrays};
+use super::rows::{Content, Narrow, RowArray, row_arrays};
 use crate::Accumulation;
 use crate::cpu::BiasCorrection;
 use crate::signals::{Field, RecordLayout, SignalPlanes, counts_dominant};
@@ -172,6 +172,11 @@ impl Sizes {
         }
     }
 
+    /// The buffer with the gradients of pixels: the loss replaces the image.
+    pub(super) fn pixel_gradient(&self) -> &'static str {
+        if self.alpha_and_depth { "pixel gradient" } else { "canvas" }
+    }
+
     /// The arrays that hold the model.
     pub(super) fn parameters(&self) -> Vec<RowArray> {
         let mut arrays = self.row_arrays();
@@ -180,7 +185,7 @@ impl Sizes {
     }
 
     /// The ranges of [`SCRATCH`]. Three uses follow each other in a step: sorting rows and entries, the loss, and the
-    /// gradients of rows between the backward pass and the optimiser.
+    /// pixels with the largest errors.
     pub(super) fn ranges(&self) -> Vec<ScratchRange> {
         let range = |line, name, at, bytes: u64| {
             let bytes = bytes.max(16).next_multiple_of(16);
@@ -193,8 +198,10 @@ impl Sizes {
             .map(|(i, name)| range("entries", name, i * numbers, 4 * self.cap))
             .collect();
         let (width, height) = self.image;
-        all.push(range("loss", "derivatives", 0, 36 * u64::from(width) * u64::from(height)));
-        all.push(range("row gradients", "gradient", 0, 4 * GRADIENT as u64 * self.trained()));
+        all.push(range("loss", "derivatives", 0, 12 * u64::from(width) * u64::from(height)));
+        // As long as the longest of the others, which a kernel can bind.
+        let largest = all.iter().map(|range| range.bytes).max().unwrap_or(0);
+        all.insert(0, range("loss", "worst", 0, largest));
         all
     }
 
@@ -230,12 +237,14 @@ impl Sizes {
         add(Section::Tiles, "tiles", "tile counts", 4 * tiles);
         add(Section::Renderer, "image and image gradient", "canvas", 16 * pixels);
         add(Section::Renderer, "image and image gradient", "finish", 8 * pixels);
-        let errors = u64::from(self.records.has(Field::Error));
-        let channels =
-            if self.alpha_and_depth { 5 } else { 3 + errors * (1 + u64::from(self.with_edges)) };
-        add(Section::Renderer, "image and image gradient", "pixel gradient", 4 * channels * pixels);
+        if self.alpha_and_depth {
+            add(Section::Renderer, "image and image gradient", "pixel gradient", 32 * pixels);
+        }
+        if self.with_edges {
+            add(Section::Renderer, "loss", "edges", 4 * pixels);
+        }
         let scratch = self.ranges().iter().map(|range| range.at + range.bytes).max();
-        add(Section::Renderer, "sorts, loss, row gradients", SCRATCH, scratch.unwrap_or(0));
+        add(Section::Renderer, "sorts and loss", SCRATCH, scratch.unwrap_or(0));
         add(Section::Renderer, "loss", "tile sums", 8 * tiles);
         if self.with_error {
             add(Section::Renderer, "loss", "error", 4 * pixels);
@@ -244,6 +253,7 @@ impl Sizes {
         // placeholder can stand in for only one of the two.
         add(Section::Renderer, "small buffers", "exposure", exposure::TRANSFORM);
         if self.exposures {
+            add(Section::Renderer, "exposure", "exposed", 16 * pixels);
             let sums = exposure::SUMS * exposure::groups(pixels);
             add(Section::Renderer, "exposure", "exposure sums", sums);
             add(Section::Renderer, "exposure", "exposure total", exposure::SUMS);
@@ -348,7 +358,7 @@ mod tests {
         let cas = Accumulation::SubgroupCas;
         let found = [(4, Storage::default()), (4, both8), (1, smallest)]
             .map(|(pairs, storage)| bytes_per_row(pairs, storage, cas));
-        assert_eq!(found, [1069, 717, 598]);
+        assert_eq!(found, [1018, 666, 518]);
         // Records, the rows of slots, and the slots of rows.
         let in_slots = bytes_per_row(4, Storage::default(), Accumulation::Slots);
         assert_eq!(in_slots - found[0], 4 * (40 + 4) + 8);

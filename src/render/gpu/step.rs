@@ -47,22 +47,22 @@ impl GpuBackend {
             frame.draw[3] |= target_flags::BY_PIXEL;
             let score = &self.planes.score;
             if score.edge > 0.0 {
-                let pixels = u64::from(camera.width) * u64::from(camera.height);
                 let weights = edge_weights(target, background, score);
-                self.write_at("pixel gradient", 4 * size_of::<f32>() as u64 * pixels, &weights);
+                self.write("edges", bytemuck::cast_slice(&weights));
             }
         }
         let (degree, signals) = (frame.model[1] as u8, self.planes.count > 0);
         let mask = self.mask.map(|mask| MaskTerm { weight: mask.weight / trained, ..mask });
         let pixels = camera.width * camera.height;
-        let signal_weights = self.planes.score.map.weights();
+        let [by_difference, by_dissimilarity] = self.planes.score.map.weights();
+        frame.errors = [0.0, 0.0, by_difference, by_dissimilarity];
         // All passes up to dL/dpixel.
-        let compare = |passes: &Passes<'_>, to: &mut Recorder<'_>, weights| {
+        let compare = |passes: &Passes<'_>, to: &mut Recorder<'_>| {
             passes.forward(to);
             if exposure.is_some() {
                 passes.expose(to, pixels);
             }
-            passes.loss(to, [weights, signal_weights]);
+            passes.loss(to, exposure.is_some(), true);
             if exposure.is_some() {
                 passes.expose_bwd(to, pixels);
             }
@@ -73,12 +73,13 @@ impl GpuBackend {
         };
         let state = if let Some((request, count)) = self.candidates.due(input.step, self.rows) {
             let weights = error_weights(request.error);
-            if weights.is_some() {
+            if let Some(weights) = weights {
                 frame.draw[3] |= target_flags::WITH_ERROR;
+                frame.errors[..2].copy_from_slice(&weights);
             }
             let search = self.search(&request, count, frame.image);
             let (state, shape) = self.run(&frame, |passes, to| {
-                compare(passes, to, weights.unwrap_or_default());
+                compare(passes, to);
                 if let Some(search) = &search {
                     passes.worst(to, search);
                 }
@@ -90,7 +91,7 @@ impl GpuBackend {
             state
         } else {
             let run = self.run(&frame, |passes, to| {
-                compare(passes, to, [0.0; 2]);
+                compare(passes, to);
                 step(passes, to);
             })?;
             run.0

@@ -111,10 +111,16 @@ impl GpuBackend {
         self.device.queue.submit([encoder.finish()]);
     }
 
-    /// Reads the last rendered image.
-    pub(super) fn rendering(&self, width: u32, height: u32) -> Result<Rendering, BackendError> {
+    /// Reads the last rendered image, with its photograph's exposure if `is_exposed`.
+    pub(super) fn rendering(
+        &self,
+        width: u32,
+        height: u32,
+        is_exposed: bool,
+    ) -> Result<Rendering, BackendError> {
         let pixels = width as usize * height as usize;
-        let canvas = self.read("canvas", 0, 16 * pixels as u64)?;
+        let image = if is_exposed { "exposed" } else { "canvas" };
+        let canvas = self.read(image, 0, 16 * pixels as u64)?;
         let finish = self.read("finish", 0, 8 * pixels as u64)?;
         let canvas = canvas.as_chunks::<4>().0;
         Ok(Rendering {

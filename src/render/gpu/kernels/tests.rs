@@ -7,7 +7,7 @@ use wgpu::naga::valid::{Capabilities, ValidationFlags, Validator};
 use wgpu::naga::{AddressSpace, StructMember, TypeInner};
 
 use densify_policies::policy::{
-    Cadence, CandidateRequest, DepthMode, ErrorMode, Needs, Signal, SignalSet,
+    Cadence, CandidateRequest, DepthMode, ErrorMode, ErrorScore, Needs, Signal, SignalSet,
 };
 
 use super::super::adapter::features_for;
@@ -120,6 +120,7 @@ fn largest_sizes(formats: Formats) -> Sizes {
         signals: SignalSet::from(Signal::ALL),
         candidates: Some(candidates),
         cadence: Cadence { all: 2, sh_rest: 2 },
+        error_score: ErrorScore { edge: 1.0, ..ErrorScore::default() },
         ..Needs::default()
     };
     let mut sizes = Sizes::new(10.into(), 100, 3, (32, 32), &needs, formats.accumulation);
@@ -142,7 +143,7 @@ fn every_kernel_is_dispatched_by_its_name() {
         let found = kernels(stage, &text, &module);
         found_kernels.extend(found.into_iter().map(|kernel| base_name(&kernel.entry).to_owned()));
     }
-    for kernel in rebound(SLOTS).keys() {
+    for kernel in rebound(&largest_sizes(SLOTS)).keys() {
         assert!(
             found_kernels.contains(*kernel),
             "`rebound` has buffers for `{kernel}`, which is no kernel"
@@ -210,7 +211,7 @@ fn struct_layouts_are_those_of_the_shaders() {
     let text = project.text(SLOTS).expect("every device projects");
     let module = parse(project, &text);
     let layouts = [
-        layout!(Frame: rotation centre lens ratio background image model rates more_rates noise score draw frozen planes),
+        layout!(Frame: rotation centre lens ratio background image model rates more_rates noise score errors draw frozen planes),
         layout!(State: visible total bands short entries_low entries_high held broken_off l1 ssim spare_f),
     ];
     for (name, mut expected, size) in layouts {
