@@ -84,6 +84,8 @@ fn run(
             target,
             background: BACKGROUND,
             exposure: None,
+            depth: None,
+            distortion: 0.0,
             sh_degree: 1,
             rates,
             loss_terms: LossTerms::default(),

@@ -67,6 +67,7 @@ impl State {
             entries: self.entries(),
             bands,
             exposure: None,
+            depth: None,
         }
     }
 }

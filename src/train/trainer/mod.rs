@@ -157,6 +157,8 @@ impl<V: ViewSource> Trainer<V> {
             target: &image,
             background: background.at(seed, step),
             exposure: exposure.as_ref(),
+            depth: None,
+            distortion: 0.0,
             sh_degree: self.sh_degree(step),
             rates: rates.at(step, iterations, self.scene.extent),
             loss_terms,
