@@ -13,4 +13,4 @@ pub mod points;
 pub mod track_colours;
 pub mod views;
 
-pub use error::{LoadError, LoadRemedy};
+pub use error::{DepthRemedy, LoadError, LoadRemedy};

@@ -1,5 +1,8 @@
 //! Depth in the loss of a training step.
 
+use clap::ValueEnum;
+use serde::{Deserialize, Serialize};
+
 use densify_core::image::depth::DepthMap;
 
 /// The term of the loss that compares a rendering with given depth.
@@ -8,7 +11,8 @@ use densify_core::image::depth::DepthMap;
 /// [median](DepthMap::median) of the given depth, D, so that a weight means the same in every unit of length. X* is
 /// the given inverse depth of a pixel, w and x the blend weights and inverse depths of the Gaussians on its ray. Blend
 /// weights receive gradient, because that is what removes Gaussians in front of a surface.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Hash)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Hash, ValueEnum, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
 pub enum DepthTerm {
     /// D·|X − X*| with X = Σ w·x / Σ w, the expected inverse depth.
     #[default]

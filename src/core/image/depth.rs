@@ -80,10 +80,8 @@ impl DepthMap {
     pub fn shrunk(&self, width: u32, height: u32) -> Self {
         let fits = |to: u32, from: u32| to > 0 && to <= from;
         assert!(fits(width, self.width) && fits(height, self.height), "not smaller");
-        let scale = [
-            f64::from(self.width) / f64::from(width),
-            f64::from(self.height) / f64::from(height),
-        ];
+        let scale =
+            [f64::from(self.width) / f64::from(width), f64::from(self.height) / f64::from(height)];
         let pixels = width as usize * height as usize;
         let (mut inverse, mut confidence) =
             (Vec::with_capacity(pixels), Vec::with_capacity(pixels));
@@ -150,15 +148,25 @@ mod tests {
     fn depth_survives_quantisation_and_stray_near_values() {
         let depths = [2.0_f32, 4.0, 100.0, 1e-4, 0.0, f32::NAN];
         let inverse: Vec<f32> = depths.iter().map(|z| 1.0 / z).collect();
-        let map = DepthMap::quantised((3, 2), &inverse, vec![255, 100, 255, 255, 255, 255]).unwrap();
+        let map =
+            DepthMap::quantised((3, 2), &inverse, vec![255, 100, 255, 255, 255, 255]).unwrap();
         for pixel in 0..3 {
             let [x, confidence] = map.inverse_depth(pixel);
-            assert!((1.0 / x / depths[pixel] - 1.0).abs() < 0.002, "{} for {}", 1.0 / x, depths[pixel]);
+            assert!(
+                (1.0 / x / depths[pixel] - 1.0).abs() < 0.002,
+                "{} for {}",
+                1.0 / x,
+                depths[pixel]
+            );
             assert!(confidence > 0.3);
         }
         // Too near, unknown (infinitely near), and not a number.
         assert_eq!((&map.inverse[3..], &map.confidence[3..]), (&[0; 3][..], &[0; 3][..]));
-        assert!((map.median - 4.0).abs() < 1e-6 || (map.median - 2.0).abs() < 1e-6, "{}", map.median);
+        assert!(
+            (map.median - 4.0).abs() < 1e-6 || (map.median - 2.0).abs() < 1e-6,
+            "{}",
+            map.median
+        );
         assert_eq!(DepthMap::quantised((1, 1), &[0.0], vec![255]), None);
         assert_eq!(map.bytes(), 18);
     }
