@@ -119,15 +119,21 @@ impl Agreement {
         }
         let own = mode(&mut ratios);
         self.by_view.push(own);
-        // Only points that all shifts cover are compared, and against this view's own scale.
-        self.shifted.resize(shifts().count(), (0.0, 0));
+        // Only points that all shifts cover are compared. A shift along a slanted surface changes the scale, so each shift
+        // is compared at its own.
+        let mut shifted: Vec<Vec<f64>> = vec![Vec::new(); shifts().count()];
         for seen in seen {
             let depths: Option<Vec<f64>> =
                 shifts().map(|shift| depth_at(seen.pixel, shift)).collect();
-            for (sum, map) in self.shifted.iter_mut().zip(depths.into_iter().flatten()) {
-                sum.0 += (map - seen.depth.ln() - own).abs().min(AGREES);
-                sum.1 += 1;
+            for (ratios, map) in shifted.iter_mut().zip(depths.into_iter().flatten()) {
+                ratios.push(map - seen.depth.ln());
             }
+        }
+        self.shifted.resize(shifted.len(), (0.0, 0));
+        for ((sum, count), mut ratios) in self.shifted.iter_mut().zip(shifted) {
+            let own = mode(&mut ratios);
+            *sum += ratios.iter().map(|ratio| (ratio - own).abs().min(AGREES)).sum::<f64>();
+            *count += ratios.len();
         }
     }
 

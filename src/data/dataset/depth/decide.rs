@@ -28,12 +28,13 @@ const SPREAD_NOTED: f64 = 0.05;
 const FIT_POINTS: usize = 10;
 const FIT_SCALES: [f64; 2] = [0.2, 5.0];
 /// Units that files have, to be suggested instead of a wrong one `[world units]`.
-const USUAL_UNITS: [(f64, &str); 8] = [
+const USUAL_UNITS: [(f64, &str); 9] = [
     (1.0, "1"),
     (0.1, "0.1"),
     (0.01, "0.01"),
     (0.001, "0.001"),
     (1e-4, "0.0001"),
+    (1e-6, "0.000001"),
     (1.0 / 5000.0, "1/5000"),
     (1.0 / 6553.5, "1/6553.5"),
     (1.0 / 4000.0, "1/4000"),
@@ -450,7 +451,7 @@ mod tests {
     #[test]
     fn relative_depth_is_fitted_with_the_sign_of_the_relation() {
         let pairs = |s: f64| -> Vec<[f64; 2]> {
-            (0..20).map(|i| [f64::from(i), s * f64::from(i) + 3.0]).collect()
+            (0..21).map(|i| [f64::from(i), s * f64::from(i) + 3.0]).collect()
         };
         for s in [0.5, -2.0] {
             let [scale, offset] = fit(&pairs(s)).unwrap();
