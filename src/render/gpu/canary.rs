@@ -122,7 +122,7 @@ impl GpuDevice {
     /// # Errors
     /// As [`GpuBackend::new`].
     pub fn run_canary(&self, needs: &Needs) -> Result<(), BackendError> {
-        self.0.check_once(RecordLayout::new(needs.signals), || check(self, needs))
+        self.0.check_once(RecordLayout::new(needs.signals, false), || check(self, needs))
     }
 }
 

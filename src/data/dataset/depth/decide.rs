@@ -27,6 +27,9 @@ const SPREAD_NOTED: f64 = 0.05;
 /// A relative map needs this many points; its scale must be within this range of multiples of the median.
 const FIT_POINTS: usize = 10;
 const FIT_SCALES: [f64; 2] = [0.2, 5.0];
+/// Repetitions of the fit, each with the pairs whose errors are at most this multiple of the median error.
+const FIT_ROUNDS: usize = 4;
+const FIT_WIDTH: f64 = 2.0;
 /// Units that files have, to be suggested instead of a wrong one `[world units]`.
 const USUAL_UNITS: [(f64, &str); 9] = [
     (1.0, "1"),
@@ -364,8 +367,7 @@ fn significant(value: f64) -> String {
     format!("{value:.digits$}")
 }
 
-/// Fits scale and offset of each view's relative map to the points that the view sees, by their medians and mean
-/// absolute deviations. Views whose fit is unreliable lose their depth.
+/// Fits scale and offset of each view's relative map to the points that the view sees. Views whose fit is unreliable lose their depth.
 fn fit_views(scene: &mut Scene<'_>, notes: &mut Vec<Note>) -> Result<(), LoadError> {
     let to_scene = scene.normalisation.scale;
     let mut fits = Vec::new();
@@ -420,17 +422,34 @@ fn fit_views(scene: &mut Scene<'_>, notes: &mut Vec<Note>) -> Result<(), LoadErr
 }
 
 /// Scale and offset that map the first numbers to the second; the scale is negative if one falls where the other grows.
+///
+/// Some pairs are points that the view does not see. The fit therefore starts with the median of the slopes between
+/// distant pairs, and is repeated with the pairs that it describes best, by least squares.
 fn fit(pairs: &[[f64; 2]]) -> Option<[f64; 2]> {
     if pairs.len() < FIT_POINTS {
         return None;
     }
-    let column = |number: usize| pairs.iter().map(move |pair| pair[number]);
-    let middles = [0, 1].map(|number| median(column(number).collect()).unwrap_or(0.0));
-    let deviation =
-        |number: usize| column(number).map(|x| (x - middles[number]).abs()).sum::<f64>();
-    let together: f64 = pairs.iter().map(|[a, b]| (a - middles[0]) * (b - middles[1])).sum();
-    let scale = deviation(1) / deviation(0) * together.signum();
-    scale.is_finite().then(|| [scale, middles[1] - scale * middles[0]])
+    let mut sorted = pairs.to_vec();
+    sorted.sort_by(|a, b| a[0].total_cmp(&b[0]));
+    let (low, high) = sorted.split_at(sorted.len() / 2);
+    let slopes = low.iter().zip(high).filter(|(a, b)| b[0] > a[0]);
+    let mut scale = median(slopes.map(|(a, b)| (b[1] - a[1]) / (b[0] - a[0])).collect())?;
+    let mut offset = median(pairs.iter().map(|[a, b]| b - scale * a).collect())?;
+    for _ in 0..FIT_ROUNDS {
+        let error = |[a, b]: &[f64; 2]| (b - scale * a - offset).abs();
+        let limit = FIT_WIDTH * median(pairs.iter().map(error).collect())?;
+        let kept: Vec<[f64; 2]> =
+            pairs.iter().filter(|&pair| error(pair) <= limit).copied().collect();
+        let count = kept.len() as f64;
+        let mean = |number: usize| kept.iter().map(|pair| pair[number]).sum::<f64>() / count;
+        let means = [mean(0), mean(1)];
+        let moment = |x: usize, y: usize| -> f64 {
+            kept.iter().map(|pair| (pair[x] - means[x]) * (pair[y] - means[y])).sum()
+        };
+        scale = moment(0, 1) / moment(0, 0);
+        offset = means[1] - scale * means[0];
+    }
+    (scale.is_finite() && offset.is_finite()).then_some([scale, offset])
 }
 
 /// The points of a cloud that seed a scene without points.
@@ -450,8 +469,10 @@ mod tests {
 
     #[test]
     fn relative_depth_is_fitted_with_the_sign_of_the_relation() {
+        // A quarter of the points is hidden behind what the map shows.
+        let hidden = |i: i32| if i % 4 == 0 { 30.0 } else { 0.0 };
         let pairs = |s: f64| -> Vec<[f64; 2]> {
-            (0..21).map(|i| [f64::from(i), s * f64::from(i) + 3.0]).collect()
+            (0..21).map(|i| [f64::from(i), s * f64::from(i) + 3.0 + hidden(i)]).collect()
         };
         for s in [0.5, -2.0] {
             let [scale, offset] = fit(&pairs(s)).unwrap();

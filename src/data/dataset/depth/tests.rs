@@ -205,7 +205,7 @@ fn depth_that_disagrees_with_the_points_is_refused_or_left_out() {
     );
     assert_eq!(remedy, Some(DepthRemedy::Unit));
     let (problem, remedy) = refusal(&|_, pixel, values| at(values, pixel) / 5.0);
-    assert!(problem.contains("0.2") && problem.contains("unit of 0.00"), "{problem}");
+    assert!(problem.contains("0.2") && problem.contains("e-3 would fit"), "{problem}");
     assert_eq!(remedy, Some(DepthRemedy::Unit));
     let (problem, remedy) = refusal(&|_, pixel, values| ray(pixel) * at(values, pixel));
     assert!(problem.contains("along rays") && problem.contains(".npy"), "{problem}");
@@ -353,7 +353,7 @@ fn depth_in_open_exr_and_with_a_mask_and_a_smaller_map_is_read() {
     }
     let data = room.load(&with(on())).unwrap();
     let (worst, counted) = error(&data, 2, |x, y| truth[(x / 2 * 2, y / 2 * 2)].0[0] / 1000.0);
-    assert!(worst < 0.002 && counted > 0.4, "{worst} {counted}");
+    assert!(worst < 0.002 && counted > 0.1, "{worst} {counted}");
 }
 
 #[test]
