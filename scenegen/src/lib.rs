@@ -15,6 +15,7 @@
 //! ```
 
 mod camera;
+mod damage;
 mod error;
 mod gltf;
 mod intersect;
@@ -42,6 +43,7 @@ mod truth;
 mod write;
 
 pub use camera::Camera;
+pub use damage::Damage;
 pub use error::Error;
 pub use lens::{Lens, LensKind};
 pub use nearest::Nearest;

@@ -8,6 +8,7 @@ use std::sync::Arc;
 use serde::{Deserialize, Serialize};
 
 use crate::camera::Camera;
+use crate::damage::Damage;
 use crate::error::Error;
 use crate::lens::Lens;
 use crate::mesh::{FileCamera, Model, Reflection};
@@ -71,6 +72,9 @@ pub struct Options {
     /// Share of training views with people walking through the scene, who are masked; 0 to 1.
     #[serde(default)]
     pub passers_by: f64,
+    /// Errors of the depth and of the poses that are written for training views.
+    #[serde(default, skip_serializing_if = "Damage::is_none")]
+    pub damage: Damage,
     /// Number and errors of the initial points.
     pub points: PointOptions,
     /// Seed of all random numbers.
@@ -96,6 +100,7 @@ impl Default for Options {
             exposure_jitter: 0.0,
             lens: None,
             passers_by: 0.0,
+            damage: Damage::default(),
             points: PointOptions::default(),
             seed: 0,
         }
@@ -297,6 +302,26 @@ impl Scene {
         frame
     }
 
+    /// The camera that is written for a view: that of the image, or with the [errors](Options::damage) of its pose.
+    pub(crate) fn written_camera(&self, view: usize) -> Camera {
+        let View { split, camera, .. } = &self.views[view];
+        match split {
+            Split::Train => self.options.damage.pose(camera, self.options.seed, view),
+            Split::Test => *camera,
+        }
+    }
+
+    /// The depth that is written for trainers: that of the image, or with the [errors](Options::damage) of a sensor.
+    pub(crate) fn written_depth(&self, view: usize, frame: &Frame) -> Vec<f32> {
+        let View { split, camera, .. } = &self.views[view];
+        match split {
+            Split::Train if !self.options.damage.is_none() => {
+                self.options.damage.depth(frame, camera, self.options.seed, view)
+            }
+            Split::Train | Split::Test => frame.depth.clone(),
+        }
+    }
+
     /// The factors on the channels of a training view, if [exposures vary](Options::exposure_jitter).
     pub fn gains(&self, view: usize) -> Option<[f32; 3]> {
         let stops = self.options.exposure_jitter;
@@ -336,6 +361,7 @@ fn check(options: &Options) -> Result<(), Error> {
     share("--outliers", options.points.outliers)?;
     share("--dropout", options.points.dropout)?;
     share("--passers-by", options.passers_by)?;
+    options.damage.check()?;
     if !(1..=64).contains(&options.grid) {
         return Err(Error::option(
             "--samples",

@@ -23,9 +23,10 @@ use densify_train::evaluate::Split;
 /// Renders the held-out views or the training views of a run, or of any file of Gaussian splats (which needs
 /// --scene for the cameras); or, with --path, a camera path through the scene, and a film of it.
 ///
-/// Depth is Σ α·T·z along each ray, in the dataset's own units: opaque surfaces show their
-/// distance along the optical axis. Depth is written in 16 bits, where 65535 stands for the largest
-/// depth of the picture, which is in depth.json.
+/// Depth is the mean Σ α·T·z / Σ α·T along each ray, measured along the optical axis in the dataset's
+/// own units, and 0 where the opacity Σ α·T is below one half. It is written as a NumPy array
+/// (NAME.depth.npy) and in 16 bits (NAME.depth.png), whose unit is in depth.json: thousandths, unless
+/// another power of ten fits better.
 #[derive(Debug, Args)]
 #[command(after_help = EXAMPLES)]
 pub(super) struct RenderArgs {
@@ -48,7 +49,7 @@ pub(super) struct RenderArgs {
     /// Also write the opacity of each pixel, as NAME.alpha.png
     #[arg(long)]
     alpha: bool,
-    /// Also write depth, as NAME.depth.png
+    /// Also write depth, as NAME.depth.png and NAME.depth.npy
     #[arg(long)]
     depth: bool,
     /// Also write photograph and render side by side, as NAME.pair.png

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::{Args, ValueEnum};
 use densify_scenegen::{
-    Ambient, Lens, Options, PRESETS, PointOptions, RigKind, Scene, Source, check_target,
+    Ambient, Damage, Lens, Options, PRESETS, PointOptions, RigKind, Scene, Source, check_target,
     contact_sheet, write,
 };
 use image::{DynamicImage, RgbaImage};
@@ -119,6 +119,35 @@ pub(super) struct ScenegenArgs {
     #[arg(long, help_heading = "Points")]
     without_thin: bool,
 
+    /// Add noise to the depth of training views (.npy only; .exr stays true): its standard deviation, as a share of the
+    /// depth
+    #[arg(long, value_name = "SHARE", help_heading = "Damage", default_value_t = 0.0)]
+    depth_noise: f64,
+    /// Distance over which this noise is correlated; up to 1: white noise
+    #[arg(long, value_name = "PX", help_heading = "Damage", default_value_t = 0.0)]
+    depth_noise_width: f64,
+    /// Share of the pixels to leave without depth, in patches
+    #[arg(long, value_name = "SHARE", help_heading = "Damage", default_value_t = 0.0)]
+    depth_holes: f64,
+    /// Share of the remaining pixels, chosen at random, that keep their depth, as after a laser scan
+    #[arg(long, value_name = "SHARE", help_heading = "Damage", default_value_t = 1.0)]
+    depth_sparse: f64,
+    /// Multiply all depths, as in a wrong unit or scale
+    #[arg(long, value_name = "FACTOR", help_heading = "Damage", default_value_t = 1.0)]
+    depth_scale: f64,
+    /// Multiply the depth of each view by another factor: the standard deviation of its logarithm
+    #[arg(long, value_name = "SHARE", help_heading = "Damage", default_value_t = 0.0)]
+    depth_scale_jitter: f64,
+    /// Write distances along rays instead of depth along the optical axis
+    #[arg(long, help_heading = "Damage")]
+    depth_along_rays: bool,
+    /// Displace depth to the right and down, such as 2,0
+    #[arg(long, value_name = "X,Y", help_heading = "Damage", value_parser = parse_shift, default_value = "0,0", allow_hyphen_values = true)]
+    depth_shift: (i32, i32),
+    /// Rotate the pose of each training view about the camera's centre: the standard deviation of the angle
+    #[arg(long, value_name = "DEGREES", help_heading = "Damage", default_value_t = 0.0)]
+    pose_noise: f64,
+
     /// Seed of all random choices
     #[arg(long, value_name = "N", default_value_t = 0)]
     seed: u64,
@@ -135,6 +164,7 @@ Examples:
   densify scenegen mesh.glb -o data/mesh --train 100 --size 400
   densify scenegen house.obj -o data/house --rig inside --bounce 64
   densify scenegen mesh.glb -o data/mesh --sky studio.hdr --ao 64
+  densify scenegen --preset room -o data/room --depth-noise 0.05 --depth-holes 0.3
   densify scenegen mesh.glb --contact-sheet look.png";
 
 /// The [`RigKind`], as named on the command line.
@@ -173,6 +203,12 @@ fn parse_size(text: &str) -> Result<(u32, u32), String> {
     Ok((width.parse().map_err(wrong)?, height.parse().map_err(wrong)?))
 }
 
+fn parse_shift(text: &str) -> Result<(i32, i32), String> {
+    let wrong = || format!("`{text}` is not a displacement; write it as 2,0");
+    let (x, y) = text.split_once(',').ok_or_else(wrong)?;
+    Ok((x.trim().parse().map_err(|_| wrong())?, y.trim().parse().map_err(|_| wrong())?))
+}
+
 impl ScenegenArgs {
     fn options(&self) -> Options {
         let ambient = match (self.ao, self.bounce) {
@@ -197,6 +233,17 @@ impl ScenegenArgs {
             exposure_jitter: self.exposure_jitter,
             lens: self.lens,
             passers_by: self.passers_by,
+            damage: Damage {
+                noise: self.depth_noise,
+                noise_width: self.depth_noise_width,
+                holes: self.depth_holes,
+                sparse: self.depth_sparse,
+                scale: self.depth_scale,
+                scale_jitter: self.depth_scale_jitter,
+                along_rays: self.depth_along_rays,
+                shift: self.depth_shift.into(),
+                pose_noise: self.pose_noise,
+            },
             points: PointOptions {
                 count: self.points,
                 noise: self.point_noise,

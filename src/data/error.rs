@@ -57,6 +57,29 @@ pub enum LoadRemedy {
     KeepFieldOfView,
     /// Name a folder that holds a COLMAP model.
     ColmapModel,
+    /// Correct the depth, or how it is read.
+    Depth(DepthRemedy),
+}
+
+/// A remedy for depth that fails a check; leaving it out is always another.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum DepthRemedy {
+    /// Add the files.
+    AddFiles,
+    /// Export the files again.
+    Repair,
+    /// State the unit of the values.
+    Unit,
+    /// Read the values as distances along rays.
+    AlongRay,
+    /// Read the values as distances along the optical axis.
+    AlongAxis,
+    /// Read the values as inverse depth of unknown scale and offset.
+    Relative,
+    /// Read the values as depth.
+    NotRelative,
+    /// Register depth and colour.
+    Register,
 }
 
 impl LoadError {

@@ -14,4 +14,4 @@ pub mod points;
 pub mod track_colours;
 pub mod views;
 
-pub use error::{LoadError, LoadRemedy};
+pub use error::{DepthRemedy, LoadError, LoadRemedy};

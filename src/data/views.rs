@@ -4,9 +4,10 @@ use std::error::Error;
 use std::path::Path;
 
 use crate::dataset::View;
-use crate::dataset::images::ImageCache;
+use crate::dataset::images::{ImageCache, Loaded};
 use crate::error::LoadError;
 use densify_core::camera::Camera;
+use densify_core::image::depth::SharedDepth;
 use densify_core::image::{Image8, SharedImage};
 
 /// The error of a source of views.
@@ -28,6 +29,17 @@ pub trait ViewSource: Send {
     /// # Errors
     /// When the image cannot be loaded.
     fn image(&self, view: usize) -> Result<SharedImage, ViewError>;
+
+    /// Image of a view, and its depth if it is used and known; both have the camera's size.
+    ///
+    /// # Errors
+    /// When the image or its depth cannot be loaded.
+    fn image_with_depth(
+        &self,
+        view: usize,
+    ) -> Result<(SharedImage, Option<SharedDepth>), ViewError> {
+        Ok((self.image(view)?, None))
+    }
 
     /// Announces the views that are needed next, in order.
     fn prefetch(&self, upcoming: &[usize]) {
@@ -98,6 +110,14 @@ impl ViewSource for DatasetViews {
 
     fn image(&self, view: usize) -> Result<SharedImage, ViewError> {
         Ok(self.cache.get(view)?)
+    }
+
+    fn image_with_depth(
+        &self,
+        view: usize,
+    ) -> Result<(SharedImage, Option<SharedDepth>), ViewError> {
+        let Loaded { image, depth } = self.cache.get_with_depth(view)?;
+        Ok((image, depth))
     }
 
     fn prefetch(&self, upcoming: &[usize]) {

@@ -8,6 +8,7 @@ mod audit;
 mod candidates;
 mod choice;
 pub mod cpu;
+mod depth;
 mod differentiable;
 mod error;
 #[cfg(feature = "gpu")]
@@ -40,6 +41,7 @@ use densify_core::gaussians::{Gaussians, ModelArray};
 use densify_core::image::Image8;
 use densify_core::memory::Ledger;
 pub use densify_shaders::Accumulation;
+pub use depth::{DepthTarget, DepthTerm};
 pub use differentiable::{Differentiable, ImageGradient};
 pub use error::{BackendError, Fit};
 pub use inspect::{Inspect, RowWeights, SurfaceDepths};
@@ -82,6 +84,12 @@ pub struct StepInput<'a> {
     /// The exposure of the photograph; requires a backend [set up](Setup::exposures) for exposures. The loss compares
     /// the photograph with the rendering after this transform, which keeps the background unchanged.
     pub exposure: Option<&'a ColourTransform>,
+    /// Given depth of the view; requires a backend [set up](Setup::depth) for depth.
+    pub depth: Option<DepthTarget<'a>>,
+    /// Weight λ of the distortion term, λ/N·Σ w·(x/X − 1)² over pixels and Gaussians, where x is a Gaussian's inverse
+    /// depth and X the pixel's expected one, held fixed; >= 0. 0 is off, else it requires a backend
+    /// [set up](Setup::depth) for depth.
+    pub distortion: f32,
     /// Spherical-harmonic degree to evaluate and train, <= the model's.
     pub sh_degree: u8,
     /// Learning rates.
@@ -147,6 +155,8 @@ pub struct StepOutput {
     pub bands: u32,
     /// Gradient of the loss with respect to the exposure, if there is one.
     pub exposure: Option<ColourGradient>,
+    /// The [depth term](DepthTerm) without its weight, if depth is given.
+    pub depth: Option<f32>,
 }
 
 /// A rendered view.

@@ -26,9 +26,10 @@ pub(super) enum Field {
     WeightSum,
     /// Number of pixels with w > 0.
     PixelCount,
-    /// Σw·(gradient with respect to depth); only for [`Differentiable`](super::Differentiable), never in training.
+    /// Gradient with respect to camera-space depth, through the depth of pixels; with [`Setup::depth`](super::Setup),
+    /// and for [`Differentiable`](super::Differentiable).
     Depth,
-    /// Σw·(error of the pixel); only in training, never together with [`Depth`](Self::Depth).
+    /// Σw·(error of the pixel); only in training.
     Error,
     /// max w; comes last, as it is the only value that is not a sum.
     WeightMax,
@@ -55,10 +56,9 @@ impl Field {
         }
     }
 
-    /// The index of this value in a complete record; depth and error share one.
+    /// The index of this value in a complete record.
     pub(super) const fn number(self) -> usize {
-        let is_after_depth = self as usize >= Self::Error as usize;
-        BASE + self as usize - is_after_depth as usize
+        BASE + self as usize
     }
 
     /// Name of the shaders' constant that holds the index of this value in a record.
@@ -87,15 +87,22 @@ pub(super) struct RecordLayout {
 
 impl RecordLayout {
     /// All fields except the error, as [`Differentiable`](super::Differentiable) needs them.
-    pub(super) const ALL: Self =
+    pub(super) const DIFFERENTIATED: Self =
         Self::with(((1 << Field::ALL.len()) - 1) & !(1 << Field::Error as u8));
     /// Values in a complete record.
     pub(super) const MOST: usize = Field::WeightMax.number() + 1;
 
-    pub(super) fn new(signals: SignalSet) -> Self {
+    /// The records of training steps, with or without depth in the loss.
+    pub(super) fn new(signals: SignalSet, depth: bool) -> Self {
         let fields =
             signals.iter().flat_map(Signal::pixel_sums).flat_map(|&sum| Field::of_sum(sum));
+        let fields = fields.chain(depth.then_some(&Field::Depth));
         Self::with(fields.fold(0, |bits, &field| bits | 1 << field as u8))
+    }
+
+    /// The layout of a step that has no depth in its loss.
+    pub(super) const fn without_depth(self) -> Self {
+        Self::with(self.fields & !(1 << Field::Depth as u8))
     }
 
     const fn with(fields: u8) -> Self {

@@ -32,7 +32,7 @@ pub use resolved::{
 };
 pub use session::{LeftOut, Occupied, Reductions, Requirements, Resumed, Run, start};
 pub use spec::{
-    AbsolutePath, Assignment, Budget, ByteCount, DataSpec, DeviceSpec, Fraction, ImageCache,
-    InitChoice, OPTIONS, OnResume, OutputSpec, Partial, PolicyFile, PolicySpec, Rows, RunOption,
-    RunSpec, ScheduleSpec, ShDegree, SizeSpec, StartSpec, Threads, Whole, knobs,
+    AbsolutePath, Assignment, Budget, ByteCount, DataSpec, DepthSpec, DeviceSpec, Fraction,
+    ImageCache, InitChoice, OPTIONS, OnResume, OutputSpec, Partial, PolicyFile, PolicySpec, Rows,
+    RunOption, RunSpec, ScheduleSpec, ShDegree, SizeSpec, StartSpec, Threads, Weight, Whole, knobs,
 };

@@ -18,6 +18,7 @@ mod candidates;
 mod central;
 mod cli;
 mod declared;
+mod depth;
 mod documents;
 mod edits;
 mod exposure;

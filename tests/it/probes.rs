@@ -61,6 +61,8 @@ fn state(backend: Box<dyn Backend>, dataset: &Dataset, measures: bool) -> (Gauss
         frozen: 0,
         has_all_bands: false,
         on_nan: OnNan::Stop,
+        depth: None,
+        distortion: 0.0,
     };
     let views = DatasetViews::new(dataset.train.clone(), 1 << 20, 1);
     let trainer = Trainer::new(views, backend, ("idle", Box::new(Idle)), scene, options);

@@ -143,6 +143,8 @@ fn trained(policy: Spatial, backend: Box<dyn Backend>, camera: &Camera) -> (Gaus
         frozen: 0,
         has_all_bands: false,
         on_nan: OnNan::Stop,
+        depth: None,
+        distortion: 0.0,
     };
     let views = OneView(*camera, Arc::new(scenes::target(camera)));
     let policy: Box<dyn DensityPolicy> = Box::new(policy);

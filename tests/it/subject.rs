@@ -159,6 +159,8 @@ pub(crate) fn step_input<'a>(
         target,
         background: BLUE,
         exposure: None,
+        depth: None,
+        distortion: 0.0,
         sh_degree,
         rates: RATES,
         loss_terms: LossTerms::default(),

@@ -39,7 +39,8 @@ pub(super) fn write(scene: &Scene, root: &Path, points: &InitPoints) -> Result<(
             "{id} {model} {} {} {} {} {} {}{rest}",
             c.width, c.height, c.fx, c.fy, c.cx, c.cy
         );
-        let rotation = c.world_from_camera.transpose();
+        // Features are where the image shows them, whatever the pose says.
+        let rotation = scene.written_camera(number).world_from_camera.transpose();
         let q = DQuat::from_mat3(&rotation).normalize();
         let t = -(rotation * c.centre);
         let _ = writeln!(

@@ -58,7 +58,7 @@ pub fn write(
         if view.split == Split::Train {
             collector.observe(number, &frame);
         }
-        write_frame(root, &view.name, &frame)?;
+        write_frame(root, &view.name, &frame, &scene.written_depth(number, &frame))?;
         if scene.options.passers_by > 0.0 {
             write_mask(root, &view.name, &frame)?;
         }
@@ -132,11 +132,13 @@ fn make_readable(folder: &Path) -> Result<(), Error> {
     Ok(())
 }
 
-fn write_frame(root: &Path, name: &str, frame: &Frame) -> Result<(), Error> {
+/// Writes the files of a view; `depth` is the one for trainers.
+fn write_frame(root: &Path, name: &str, frame: &Frame, depth: &[f32]) -> Result<(), Error> {
     let path = root.join("images").join(format!("{name}.png"));
     write_png(&path, frame.width, frame.height, frame.photograph(), ExtendedColorType::Rgba8)?;
     exr::write_depth(&root.join("depth").join(format!("{name}.exr")), frame)?;
-    npy::write_depth(&root.join("depth").join(format!("{name}.npy")), frame)?;
+    let size = (frame.width, frame.height);
+    npy::write_depth(&root.join("depth").join(format!("{name}.npy")), size, depth)?;
     exr::write_normals(&root.join("normals").join(format!("{name}.exr")), frame)
 }
 

@@ -7,13 +7,15 @@ use std::path::Path;
 
 use super::write_file;
 use crate::error::Error;
-use crate::trace::Frame;
 
 /// Writes depth `[world units / 1000]`, 0 where there is no surface. Shape: `[height, width]`.
-pub(super) fn write_depth(path: &Path, frame: &Frame) -> Result<(), Error> {
+pub(super) fn write_depth(
+    path: &Path,
+    (width, height): (u32, u32),
+    depth: &[f32],
+) -> Result<(), Error> {
     // Size of magic, version and length.
     const PREFIX: usize = 10;
-    let (height, width) = (frame.height, frame.width);
     let header =
         format!("{{'descr': '<f4', 'fortran_order': False, 'shape': ({height}, {width}), }}");
     // The header is padded to a multiple of 64 bytes, including its line end.
@@ -21,6 +23,6 @@ pub(super) fn write_depth(path: &Path, frame: &Frame) -> Result<(), Error> {
     let mut bytes = b"\x93NUMPY\x01\x00".to_vec();
     bytes.extend((padded as u16).to_le_bytes());
     bytes.extend(format!("{header:0$}\n", padded - 1).bytes());
-    bytes.extend(frame.depth.iter().flat_map(|depth| (1000.0 * depth).to_le_bytes()));
+    bytes.extend(depth.iter().flat_map(|depth| (1000.0 * depth).to_le_bytes()));
     write_file(path, &bytes)
 }

@@ -29,12 +29,14 @@ pub(super) fn write(scene: &Scene, root: &Path) -> Result<(), Error> {
 
 /// The views of a split, with the intrinsics `first` at the top; each view lists only the intrinsics that differ.
 fn synthetic(scene: &Scene, first: &Value, split: Split) -> Value {
-    let frame = |view: &View| {
-        let mut frame = frame_with_pose(view, format!("./images/{}", view.name));
+    let frame = |(number, view): (usize, &View)| {
+        let pose = scene.written_camera(number);
+        let mut frame = frame_with_pose(&pose, format!("./images/{}", view.name));
         extend(&mut frame, &intrinsics(scene, &view.camera), |key, value| first[key] != *value);
         frame
     };
-    let frames = scene.views.iter().filter(|view| view.split == split).map(frame);
+    let views = scene.views.iter().enumerate().filter(|(_, view)| view.split == split);
+    let frames = views.map(frame);
     let mut top = json!({ "ply_file_path": POINTS, "frames": frames.collect::<Value>() });
     extend(&mut top, first, |_, _| true);
     top
@@ -45,8 +47,8 @@ fn synthetic(scene: &Scene, first: &Value, split: Split) -> Value {
 fn nerfstudio(scene: &Scene, first: &Value) -> Value {
     let shared = scene.views.iter().all(|view| intrinsics(scene, &view.camera) == *first);
     let image = |view: &View| format!("images/{}.png", view.name);
-    let frame = |view: &View| {
-        let mut frame = frame_with_pose(view, image(view));
+    let frame = |(number, view): (usize, &View)| {
+        let mut frame = frame_with_pose(&scene.written_camera(number), image(view));
         frame["depth_file_path"] = json!(format!("depth/{}.npy", view.name));
         extend(&mut frame, &intrinsics(scene, &view.camera), |_, _| !shared);
         if scene.options.passers_by > 0.0 {
@@ -57,7 +59,7 @@ fn nerfstudio(scene: &Scene, first: &Value) -> Value {
     let mut top = json!({
         "camera_model": "OPENCV", "k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0,
         "ply_file_path": POINTS,
-        "frames": scene.views.iter().map(frame).collect::<Value>(),
+        "frames": scene.views.iter().enumerate().map(frame).collect::<Value>(),
     });
     extend(&mut top, first, |_, _| shared);
     let files = |split: Split| -> Value {
@@ -72,8 +74,8 @@ fn nerfstudio(scene: &Scene, first: &Value) -> Value {
     top
 }
 
-fn frame_with_pose(view: &View, file: String) -> Value {
-    json!({ "file_path": file, "transform_matrix": world_from_opengl(&view.camera) })
+fn frame_with_pose(pose: &Camera, file: String) -> Value {
+    json!({ "file_path": file, "transform_matrix": world_from_opengl(pose) })
 }
 
 /// Copies the fields for which `wanted` is true.

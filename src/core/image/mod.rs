@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+pub mod depth;
 pub mod resample;
 
 /// A decoded image.

@@ -79,6 +79,9 @@ pub(super) fn load(path: &Path, options: &LoadOptions) -> Result<Dataset, LoadEr
         if let Some(mask) = &mut source.mask {
             mask.file = mask.file.clone().in_archive(&unpacked);
         }
+        for file in source.depth.iter_mut().flat_map(|depth| depth.files_mut()) {
+            *file = file.clone().in_archive(&unpacked);
+        }
     }
     path.clone_into(&mut dataset.root);
     dataset.unpacked = Some(unpacked);

@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 use unicode_normalization::UnicodeNormalization;
 
 use super::LoadError;
+use super::depth::DepthChoice;
 use super::mask_files;
 use super::paths::{DataPath, PHOTOGRAPHS, Root, is_absolute, namesake, relative};
 use super::{Frame, LoadOptions, Resolution};
@@ -26,6 +27,8 @@ pub(super) struct Folders {
     reduced: Option<(Root, u32)>,
     /// True if names are relative to `images/`, as in COLMAP models, rather than to the dataset's folder.
     within_images: bool,
+    /// True if depth is looked for.
+    pub(super) reads_depth: bool,
 }
 
 /// The file of an image.
@@ -60,7 +63,9 @@ impl Folders {
             _ => None,
         };
         let mask_folders = mask_files::folders(root.path());
-        Ok(Self { root: root.clone(), chosen, mask_folders, reduced, within_images })
+        let reads_depth =
+            options.depth.choice != DepthChoice::Off && options.depth.points.is_none();
+        Ok(Self { root: root.clone(), chosen, mask_folders, reduced, within_images, reads_depth })
     }
 
     /// The file of an image, if there is one.

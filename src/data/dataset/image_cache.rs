@@ -10,7 +10,17 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 
 use super::LoadError;
-use super::images::{Image8, ImageSource, SharedImage};
+use super::images::{ImageSource, SharedImage};
+use densify_core::image::depth::SharedDepth;
+
+/// A decoded image, with the depth of its view.
+#[derive(Debug, Clone)]
+pub struct Loaded {
+    /// The image.
+    pub image: SharedImage,
+    /// Its depth, if it is used and known.
+    pub depth: Option<SharedDepth>,
+}
 
 /// Decodes images on demand. Caching affects waiting times only, never pixels.
 #[derive(Debug)]
@@ -56,7 +66,7 @@ enum Content {
     #[default]
     Empty,
     Loading,
-    Ready(SharedImage),
+    Ready(Loaded),
     Failed(LoadError),
 }
 
@@ -107,14 +117,25 @@ impl ImageCache {
         self.shared.work.notify_all();
     }
 
-    /// The image of source `index`; decodes it, or waits until a background thread has decoded it.
+    /// The image of source `index`; see [`get_with_depth`](Self::get_with_depth).
+    ///
+    /// # Errors
+    /// As [`get_with_depth`](Self::get_with_depth).
+    ///
+    /// # Panics
+    /// When there is no such source.
+    pub fn get(&self, index: usize) -> Result<SharedImage, LoadError> {
+        self.get_with_depth(index).map(|loaded| loaded.image)
+    }
+
+    /// The image and the depth of source `index`; decodes them, or waits until a background thread has decoded it.
     ///
     /// # Errors
     /// When the file cannot be loaded. The next call tries again.
     ///
     /// # Panics
     /// When there is no such source.
-    pub fn get(&self, index: usize) -> Result<SharedImage, LoadError> {
+    pub fn get_with_depth(&self, index: usize) -> Result<Loaded, LoadError> {
         let source = &self.shared.sources[index];
         let mut state = self.shared.lock();
         state.slots[index].is_announced = false;
@@ -124,11 +145,11 @@ impl ImageCache {
             let slot = &mut state.slots[index];
             slot.used = clock;
             match std::mem::take(&mut slot.content) {
-                Content::Ready(image) => {
-                    slot.content = Content::Ready(Arc::clone(&image));
+                Content::Ready(loaded) => {
+                    slot.content = Content::Ready(loaded.clone());
                     // The image may now be evicted, which a thread may be waiting for.
                     self.shared.work.notify_all();
-                    return Ok(image);
+                    return Ok(loaded);
                 }
                 Content::Failed(error) => return Err(error),
                 Content::Loading => {
@@ -144,7 +165,7 @@ impl ImageCache {
             state.slots[index].content = Content::Loading;
         }
         drop(state);
-        let result = load(source).map(Arc::new);
+        let result = load(source);
         if cached {
             let mut state = self.shared.lock();
             state.finish(&self.shared, index, result.clone());
@@ -188,7 +209,7 @@ impl Shared {
             state.queue.pop_front();
             state.slots[index].content = Content::Loading;
             drop(state);
-            let result = load(&self.sources[index]).map(Arc::new);
+            let result = load(&self.sources[index]);
             state = self.lock();
             state.finish(self, index, result);
             self.loaded.notify_all();
@@ -217,12 +238,12 @@ impl State {
     }
 
     /// Stores the result of loading an image for which [`Self::make_room`] reserved memory.
-    fn finish(&mut self, shared: &Shared, index: usize, result: Result<SharedImage, LoadError>) {
+    fn finish(&mut self, shared: &Shared, index: usize, result: Result<Loaded, LoadError>) {
         if result.is_err() {
             self.bytes -= shared.sources[index].loaded_bytes();
         }
         self.slots[index].content = match result {
-            Ok(image) => Content::Ready(image),
+            Ok(loaded) => Content::Ready(loaded),
             Err(error) => Content::Failed(error),
         };
     }
@@ -268,9 +289,13 @@ impl ImageDemand {
     }
 }
 
-/// Loads an image, turning a panic of the decoder into an error.
-fn load(source: &ImageSource) -> Result<Image8, LoadError> {
-    catch_unwind(AssertUnwindSafe(|| source.load()))
+/// Loads an image with its depth, turning a panic of the decoder into an error.
+fn load(source: &ImageSource) -> Result<Loaded, LoadError> {
+    let load = || {
+        let image = Arc::new(source.load()?);
+        Ok(Loaded { image, depth: source.load_depth()? })
+    };
+    catch_unwind(AssertUnwindSafe(load))
         .unwrap_or_else(|_| Err(LoadError::image(&source.file.path, "the decoder failed")))
 }
 

@@ -7,7 +7,8 @@ use image::DynamicImage;
 use image::metadata::Orientation;
 
 use super::LoadError;
-pub use super::image_cache::{ImageCache, ImageDemand};
+use super::depth::DepthSource;
+pub use super::image_cache::{ImageCache, ImageDemand, Loaded};
 use super::image_file;
 pub(super) use super::image_file::{decode, decode_checked, read_colours, read_header};
 pub use super::mask::{Hides, Mask};
@@ -15,8 +16,12 @@ use super::options::MaskMode;
 pub use super::source_file::SourceFile;
 use super::undistort::Undistortion;
 use densify_core::image::Window;
+use densify_core::image::depth::SharedDepth;
 use densify_core::image::resample;
 pub use densify_core::image::{Image8, SharedImage};
+
+/// Size of a pixel of a [depth map](densify_core::image::depth::DepthMap) `[bytes]`.
+const DEPTH_BYTES: u64 = 3;
 
 /// The source of a view's pixels and their processing on load.
 #[derive(Debug, Clone)]
@@ -37,6 +42,8 @@ pub struct ImageSource {
     pub rendered: Option<SharedImage>,
     /// The part of the loaded image that is used; `None`: the whole image.
     pub window: Option<Window>,
+    /// The depth of the view, if it is used.
+    pub depth: Option<Box<DepthSource>>,
 }
 
 /// The header of an image file. Its `Debug` text is part of the fingerprint in checkpoints.
@@ -64,7 +71,17 @@ impl ImageSource {
         let (width, height) = (header.width, header.height);
         let (mask, undistortion, rendered) = (None, None, None);
         let file = SourceFile::existing(path).expect("an image");
-        Self { file, mask, width, height, undistortion, header, rendered, window: None }
+        Self {
+            file,
+            mask,
+            width,
+            height,
+            undistortion,
+            header,
+            rendered,
+            window: None,
+            depth: None,
+        }
     }
 
     /// Pixels in memory, which are shrunk to this size on load. Messages call them `name`.
@@ -78,17 +95,23 @@ impl ImageSource {
             file_bytes: 0,
         };
         let (file, rendered) = (SourceFile::rendered(name), Some(Arc::new(image)));
-        let (mask, undistortion, window) = (None, None, None);
-        Self { file, mask, width, height, undistortion, header, rendered, window }
+        let (mask, undistortion, window, depth) = (None, None, None, None);
+        Self { file, mask, width, height, undistortion, header, rendered, window, depth }
     }
 
-    /// Largest size of the loaded image `[bytes]`.
+    /// Largest size of the loaded image, with its depth `[bytes]`.
     pub(crate) fn loaded_bytes(&self) -> u64 {
+        let depth = if self.depth.is_some() { DEPTH_BYTES } else { 0 };
+        self.pixels() * (self.channels() + depth)
+    }
+
+    /// Number of pixels of the loaded image.
+    fn pixels(&self) -> u64 {
         let [width, height] = match self.window {
             Some(window) => [window.width, window.height],
             None => [self.width, self.height],
         };
-        u64::from(width) * u64::from(height) * self.channels()
+        u64::from(width) * u64::from(height)
     }
 
     /// Peak memory while loading, including the result `[bytes]`.
@@ -101,9 +124,12 @@ impl ImageSource {
         let undistort = if self.undistortion.is_some() { packed + whole } else { packed };
         let shrunk = bytes((self.width, self.height));
         let shrink = if self.shrinks() { whole + shrunk } else { whole };
-        let cut = if self.window.is_some() { shrunk + self.loaded_bytes() } else { 0 };
+        let loaded = self.pixels() * self.channels();
+        let cut = if self.window.is_some() { shrunk + loaded } else { 0 };
         let turn = if self.header.turn.is_some() { 2 * self.header.decoded_bytes } else { 0 };
-        decode.max(turn).max(pack).max(undistort).max(shrink).max(cut)
+        let depth =
+            self.depth.as_ref().map_or(0, |depth| loaded + depth.working_bytes(self.pixels()));
+        decode.max(turn).max(pack).max(undistort).max(shrink).max(cut).max(depth)
     }
 
     fn channels(&self) -> u64 {
@@ -128,7 +154,7 @@ impl ImageSource {
     }
 
     /// Width and height before shrinking `[px]`.
-    fn whole_size(&self) -> (u32, u32) {
+    pub(super) fn whole_size(&self) -> (u32, u32) {
         match &self.undistortion {
             Some(undistortion) => (undistortion.to.width, undistortion.to.height),
             None => (self.header.width, self.header.height),
@@ -149,6 +175,14 @@ impl ImageSource {
             Some(window) => image.windowed(window),
             None => image,
         })
+    }
+
+    /// The depth at the pixels of the loaded image; `None` if there is none, or none is known.
+    ///
+    /// # Errors
+    /// As [`load`](Self::load).
+    pub fn load_depth(&self) -> Result<Option<SharedDepth>, LoadError> {
+        self.depth.as_ref().map_or(Ok(None), |depth| depth.load(self))
     }
 
     fn load_whole(&self) -> Result<Image8, LoadError> {

@@ -7,6 +7,7 @@ mod archive;
 pub mod builtin;
 mod colmap;
 mod colours;
+mod depth;
 mod exif;
 mod folders;
 mod formats;
@@ -54,6 +55,10 @@ pub use builtin::GroundTruth;
 use densify_core::camera::Camera;
 use densify_core::memory::Bytes;
 use densify_core::numbers::grouped;
+use depth::DepthFile;
+pub use depth::{
+    DepthAlong, DepthChoice, DepthFinding, DepthOptions, DepthOrigin, DepthSource, DepthUnit,
+};
 pub use exif::ReportedExposures;
 use formats::read_scene;
 pub use formats::{DatasetFormat, formats};
@@ -88,6 +93,8 @@ pub struct Dataset {
     pub normalisation: Normalisation,
     /// Peak memory for building the [known surface](Self::ground_truth) `[bytes]`; `None` if the surface is not known.
     pub surface_bytes: Option<u64>,
+    /// The depth that the training views have, and the evidence for it; `None` without.
+    pub depth: Option<DepthFinding>,
     /// Notes for the user about dropped points, missing frames and the like.
     pub notes: Vec<Note>,
 }
@@ -120,6 +127,13 @@ pub enum Note {
         percent: f64,
         /// Number of photographs that are cropped noticeably.
         photographs: usize,
+    },
+    /// Depth was found, but is not used because of this fault.
+    DepthLeftOut(Box<LoadError>),
+    /// The scale of depth differs between views, which fitting each of them to its points would correct.
+    DepthScalesDiffer {
+        /// Half of the views differ by at least this much `[%]`.
+        percent: f64,
     },
 }
 
@@ -167,6 +181,7 @@ struct Frame {
     /// Divisor K of the folder `images_K` that contains the image.
     reduced: Option<u32>,
     mask: Option<MaskFile>,
+    depth: Option<DepthFile>,
     lens: Lens,
     /// Header of the image, if the pose file states no image size; the lens then has the size of the image.
     header: Option<ImageHeader>,

@@ -6,8 +6,10 @@ use std::str::FromStr;
 
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
+use super::depth::DepthOptions;
+
 /// Options for loading a dataset.
-#[derive(Debug, Clone, Default, PartialEq, Eq)]
+#[derive(Debug, Clone, Default, PartialEq)]
 pub struct LoadOptions {
     /// Folder of the images, relative to the dataset, instead of the one named in its files. Images outside the
     /// dataset's folder can only be used with this option.
@@ -33,6 +35,8 @@ pub struct LoadOptions {
     pub cache: Option<PathBuf>,
     /// True to read the [`Tracks`](super::Tracks) of the reconstruction's points.
     pub tracks: bool,
+    /// Depth beside the photographs.
+    pub depth: DepthOptions,
 }
 
 /// Training resolution. Images are never enlarged.

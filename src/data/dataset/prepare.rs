@@ -5,6 +5,7 @@ use std::path::Path;
 
 use glam::DVec3;
 
+use super::depth::{self, first_points};
 use super::mask_files::unused_masks_note;
 use super::normalise::{self, Normalisation};
 use super::photographs::{Photograph, photographs};
@@ -49,7 +50,14 @@ pub(super) fn assemble(
     mut notes: Vec<Note>,
     options: &LoadOptions,
 ) -> Result<Dataset, LoadError> {
-    let Scene { listing, mut points, points_file, tracks, own_split, surface_bytes, .. } = scene;
+    let Scene { listing, mut points, mut points_file, tracks, own_split, surface_bytes, .. } =
+        scene;
+    if points.is_empty()
+        && let Some(cloud) = first_points(options)?
+    {
+        points = cloud;
+        points_file.clone_from(&options.depth.points);
+    }
     let surface_bytes = surface_bytes.or_else(|| super::builtin::surface_bytes(path));
     let centres: Vec<_> =
         photographs.iter().map(|photograph| photograph.views[0].camera.centre()).collect();
@@ -67,6 +75,7 @@ pub(super) fn assemble(
     let mut views_by_id = HashMap::new();
     let (mut train, mut test) = (Vec::<View>::new(), Vec::new());
     let mut hidden_names = Vec::new();
+    let mut depth_fault = None;
     // Centres of the training cameras that are not outliers.
     let mut near = Vec::new();
     for (index, photograph) in photographs.into_iter().enumerate() {
@@ -74,7 +83,7 @@ pub(super) fn assemble(
         if is_far[index] && options.far_cameras == FarCameras::LeaveOut {
             continue;
         }
-        let Photograph { views, hidden, held_out, id } = photograph;
+        let Photograph { views, hidden, held_out, id, depth_fault: fault } = photograph;
         // Without a mask, `hidden` is empty.
         let hidden = hidden.into_iter().chain(std::iter::repeat(false));
         let (out, views): (Vec<_>, Vec<_>) =
@@ -87,6 +96,7 @@ pub(super) fn assemble(
         } else {
             let first = train.len() as u32;
             views_by_id.extend(id.map(|id| (id, first..first + views.len() as u32)));
+            depth_fault = depth_fault.or(fault);
             near.extend((!is_far[index]).then(|| centres[index]));
             train.extend(views);
         }
@@ -137,9 +147,32 @@ pub(super) fn assemble(
         let mut numbers = views_by_id.get(&id)?.clone();
         if numbers.len() == 1 { numbers.next() } else { numbers.find(|&view| shows(view, point)) }
     });
+    let depth = depth::decide(
+        depth::Scene {
+            train: &mut train,
+            test: &mut test,
+            points: &points,
+            normalisation: &normalisation,
+            is_truth: surface_bytes.is_some(),
+            fault: depth_fault,
+        },
+        options,
+        &mut notes,
+    )?;
     let root = path.to_owned();
     let unpacked = None;
-    Ok(Dataset { root, unpacked, train, test, points, tracks, normalisation, surface_bytes, notes })
+    Ok(Dataset {
+        root,
+        unpacked,
+        train,
+        test,
+        points,
+        tracks,
+        normalisation,
+        surface_bytes,
+        depth,
+        notes,
+    })
 }
 
 /// Note about views whose camera is far from all others.

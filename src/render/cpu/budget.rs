@@ -56,7 +56,7 @@ pub(super) fn ledger(sh_degree: u8, options: &Setup, threads: usize) -> Ledger {
     let budget = options.row_budget().total;
     let cap = tile_cap(options) as u64;
     let needs = &options.needs;
-    let signals = Accumulators::new(0..1, needs);
+    let signals = Accumulators::new(0..1, needs, options.depth);
     let stride = signals.layout().stride();
     let per_row = planes(sh_degree);
     let padded = budget.next_multiple_of(WIDTH) as u64;

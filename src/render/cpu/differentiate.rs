@@ -1,8 +1,10 @@
 //! Gradients and losses outside of training; see [`Differentiable`].
 
+use super::depth_gradient::{BY_ALPHA, CENTRE, DepthChannel, SQUARE};
 use super::loss::ErrorRequests;
 use super::optimise::Differentiate;
 use super::rasterize::{DepthPlane, ZERO_PLANE};
+use super::rasterize_bwd::BY_DEPTH;
 use super::tiles::Grid;
 use super::{CpuBackend, ModelGradient, for_each_pixel, scalars};
 use crate::signals::RecordLayout;
@@ -19,23 +21,27 @@ impl Differentiable for CpuBackend {
         upstream: &ImageGradient,
     ) -> Result<(Rendering, ModelGradient), BackendError> {
         upstream.assert_size(camera);
-        let records = self.record_cap * RecordLayout::MOST;
+        let records = self.record_cap * RecordLayout::DIFFERENTIATED.stride();
         if self.records.len() < records {
             self.records = bytemuck::zeroed_vec(records);
         }
         let frame = self.forward(camera, background, sh_degree, DepthPlane::Depth, None)?;
         let rendering = self.rendering(&frame);
-        for (tile, gradient) in self.gradient[..frame.grid.tiles()].iter_mut().enumerate() {
+        let tiles = self.gradient[..frame.grid.tiles()].iter_mut().zip(&mut self.canvas);
+        for (tile, (gradient, canvas)) in tiles.enumerate() {
             gradient.planes = [ZERO_PLANE; 5];
+            for plane in [CENTRE, SQUARE, BY_ALPHA] {
+                canvas.planes[plane] = ZERO_PLANE;
+            }
             for_each_pixel(&frame.grid, tile, |patch, lane, at| {
                 for channel in 0..3 {
                     gradient.planes[channel][patch][lane] = upstream.rgb[3 * at + channel];
                 }
-                gradient.planes[3][patch][lane] = upstream.alpha[at];
-                gradient.planes[4][patch][lane] = upstream.depth[at];
+                gradient.planes[BY_DEPTH][patch][lane] = upstream.depth[at];
+                canvas.planes[BY_ALPHA][patch][lane] = upstream.alpha[at];
             });
         }
-        self.backward(&frame, RecordLayout::ALL);
+        self.backward(&frame, RecordLayout::DIFFERENTIATED, DepthChannel::DEPTH);
         let mut gradient = ModelGradient::zeros(self.rows, self.sh_degree);
         self.arch.dispatch(Differentiate {
             params: self.params.view(self.rows),

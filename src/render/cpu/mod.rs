@@ -13,6 +13,7 @@ mod batch;
 mod blocks;
 mod budget;
 mod candidates;
+mod depth_gradient;
 mod differentiate;
 mod exposure;
 mod footprint;
@@ -64,6 +65,7 @@ use densify_core::budget::RowBudget;
 use densify_core::camera::Camera;
 use densify_core::gaussians::{Gaussians, ModelArray};
 use densify_core::memory::Ledger;
+use depth_gradient::DepthChannel;
 use loss::{ErrorRequests, LossBuffers};
 use mask::Masks;
 use moments::Moments;
@@ -159,7 +161,7 @@ impl CpuBackend {
         let ledger = budget::ledger(model.sh_degree, options, threads.count());
         budget::reserve(&ledger)?;
         let trained = budget::trained(options);
-        let signals = Accumulators::new(trained.clone(), &options.needs);
+        let signals = Accumulators::new(trained.clone(), &options.needs, options.depth);
         let (stride, sum_width) = (signals.layout().stride(), signals.sum_width());
         let (cap, record_cap) = (budget::tile_cap(options), budget::record_cap(options));
         let per_row = planes(model.sh_degree);
@@ -217,7 +219,9 @@ impl CpuBackend {
     fn step(&mut self, input: &StepInput<'_>) -> Result<StepOutput, BackendError> {
         let StepInput { camera, target, background, exposure, .. } = *input;
         let unexposed = exposure.map_or(background, |exposure| exposure.behind(background));
-        let frame = self.forward(camera, unexposed, input.sh_degree, DepthPlane::Unused, None)?;
+        let depth = self.depth_loss(input);
+        let plane = depth.map_or(DepthPlane::Unused, DepthPlane::of_loss);
+        let frame = self.forward(camera, unexposed, input.sh_degree, plane, None)?;
         if let Some(exposure) = exposure {
             self.expose(&frame.grid, exposure);
         }
@@ -232,14 +236,23 @@ impl CpuBackend {
             let photograph = Photograph { target, background, exposure };
             self.collect_candidates(&frame, photograph, &request, count);
         }
-        self.backward(&frame, self.signals.layout());
-        self.optimise(&frame, input);
+        let (mut layout, mut channel) = (self.signals.layout(), DepthChannel::DEPTH);
+        let mut depth_value = None;
+        if let Some(depth) = depth {
+            channel = DepthChannel::of_loss(depth.term);
+            depth_value = self.depth_gradient(&frame.grid, depth);
+        } else {
+            layout = layout.without_depth();
+        }
+        self.backward(&frame, layout, channel);
+        self.optimise(&frame, input, layout);
         self.clock.lap("project_bwd + adam");
         Ok(StepOutput {
             visible: frame.visible,
             entries: frame.entries,
             bands: frame.bands.len() as u32,
             exposure: exposure_gradient,
+            depth: depth_value,
             ..scalars(value)
         })
     }

@@ -228,7 +228,7 @@ impl WithSimd for Differentiate<'_> {
     #[inline(always)]
     fn with_simd<S: Simd>(self, s: S) {
         let Self { params, sums, visible, view, out } = self;
-        let per_block = WIDTH * RecordLayout::MOST;
+        let per_block = WIDTH * RecordLayout::DIFFERENTIATED.stride();
         let sh_planes = out.sh.len() / out.means.len().max(1);
         let mut g = BlockGradient::ZERO;
         let mut scratch = Scratch::ZERO;
@@ -236,7 +236,7 @@ impl WithSimd for Differentiate<'_> {
         for b in 0..params.blocks {
             let block = params.open(b, planes(view.sh_degree), &mut scratch);
             let sums = &sums[b * per_block..(b + 1) * per_block];
-            g.compute(s, block, sums, RecordLayout::ALL, visible[b], view);
+            g.compute(s, block, sums, RecordLayout::DIFFERENTIATED, visible[b], view);
             for lane in 0..WIDTH.min(out.means.len() - b * WIDTH) {
                 let row = b * WIDTH + lane;
                 let at = |p: usize| g.params[p * WIDTH + lane];

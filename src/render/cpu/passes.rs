@@ -11,6 +11,7 @@ use rayon::prelude::*;
 use super::batch::Batch;
 use super::blocks::parts;
 use super::candidates;
+use super::depth_gradient::DepthChannel;
 use super::loss::{ErrorRequests, LossValue};
 use super::optimise::Optimise;
 use super::project::{Project, ViewParams};
@@ -73,7 +74,7 @@ impl CpuBackend {
         camera: &Camera,
         background: [f32; 3],
         sh_degree: u8,
-        depth_plane: DepthPlane,
+        depth_plane: DepthPlane<'_>,
         colours: Option<&[[f32; 3]]>,
     ) -> Result<Frame, BackendError> {
         if camera.width > MAX_SIDE || camera.height > MAX_SIDE {
@@ -157,7 +158,7 @@ impl CpuBackend {
     }
 
     /// Stage 5: computes the sum of each row's records, `self.sums`, from `self.gradient`.
-    pub(super) fn backward(&mut self, frame: &Frame, layout: RecordLayout) {
+    pub(super) fn backward(&mut self, frame: &Frame, layout: RecordLayout, depth: DepthChannel) {
         let Frame { grid, background, bands, .. } = frame;
         let blending = self.shortcuts.into();
         self.reserve_sums(layout);
@@ -203,6 +204,7 @@ impl CpuBackend {
                                 canvas: &canvas[tile],
                                 upstream: &gradient[tile],
                                 layout,
+                                depth,
                                 records: part.records(lists, i, records, stride),
                                 batch,
                                 blended,
@@ -328,7 +330,7 @@ impl CpuBackend {
     }
 
     /// Stages 6–8 in one pass over the rows, so that gradients stay in the cache.
-    pub(super) fn optimise(&mut self, frame: &Frame, input: &StepInput<'_>) {
+    pub(super) fn optimise(&mut self, frame: &Frame, input: &StepInput<'_>, layout: RecordLayout) {
         let Self {
             threads, arch, params, moments, masks, ages, signals, sums, visible, bias, ..
         } = self;
@@ -338,7 +340,7 @@ impl CpuBackend {
         let terms = Terms::new(input.loss_terms, trained);
         let noise = input.noise.map(|term| Noise::new(term, input));
         let due = self.summed.advance(input);
-        let (planes, layout) = (signals.planes, signals.layout());
+        let planes = signals.planes;
         let signal_stride = signals.blocks.stride();
         let rounding_rng = PolicyRng::new(input.seed, input.step);
         // Tasks that have only frozen rows are skipped.
@@ -393,15 +395,8 @@ impl CpuBackend {
 }
 
 /// Calls `f(patch, lane, pixel of the image)` for every pixel of a tile inside the image.
-pub(super) fn for_each_pixel(grid: &Grid, tile: usize, mut f: impl FnMut(usize, usize, usize)) {
-    let place = TilePlace::new(grid, tile);
-    for y in 0..place.height {
-        for x in 0..place.width {
-            let at = (place.y as usize + y) * grid.width + place.x as usize + x;
-            let (patch, lane) = in_plane(x, y);
-            f(patch, lane, at);
-        }
-    }
+pub(super) fn for_each_pixel(grid: &Grid, tile: usize, f: impl FnMut(usize, usize, usize)) {
+    TilePlace::new(grid, tile).for_each_pixel(grid.width, f);
 }
 
 pub(super) fn scalars(value: LossValue) -> StepOutput {

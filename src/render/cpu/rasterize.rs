@@ -19,6 +19,7 @@ use super::project::Splat;
 use super::simd::{V, WIDTH, exp2_of, load_of, store_of};
 use super::tiles::{Entry, Grid, TILE};
 use crate::Shortcuts;
+use crate::depth::DepthLoss;
 
 /// The largest alpha. It keeps 1 − alpha above 0, so that the backward pass can recover transmittances by division.
 pub(super) const ALPHA_MAX: f32 = 0.99;
@@ -39,17 +40,37 @@ impl From<Shortcuts> for Blending {
 }
 
 /// The quantity accumulated in the depth plane.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum DepthPlane {
+#[derive(Debug, Clone, Copy)]
+pub(super) enum DepthPlane<'a> {
     /// Nothing.
     Unused,
     /// Depth, weighted as in blending.
     Depth,
     /// The number of Gaussians blended into the pixel.
     BlendedCount,
+    /// Inverse depth, weighted as in blending.
+    Inverse,
+    /// The distance of inverse depth from the given one, weighted as in blending; where none is given, as
+    /// [`Inverse`](Self::Inverse).
+    Distance(DepthLoss<'a>),
 }
 
-/// Planes of a rendered tile: red, green, blue, final transmittance, depth.
+impl DepthPlane<'_> {
+    /// The inverse depth given in each pixel of a tile, from which distances are taken; 0 where there is none.
+    fn given(self, place: &TilePlace) -> Plane {
+        let mut plane = ZERO_PLANE;
+        if let Self::Distance(loss) = self {
+            place.for_each_pixel(loss.width, |patch, lane, pixel| {
+                let [inverse, confidence] = loss.given(pixel);
+                plane[patch][lane] = if confidence > 0.0 { inverse } else { 0.0 };
+            });
+        }
+        plane
+    }
+}
+
+/// Planes of a rendered tile: red, green, blue, final transmittance, depth. Before the backward pass of a step with
+/// depth in its loss, [`depth_gradient`](super::depth_gradient) replaces all but the transmittance.
 pub(super) const CANVAS_PLANES: usize = 5;
 pub(super) const TRANSMITTANCE: usize = 3;
 pub(super) const DEPTH: usize = 4;
@@ -130,6 +151,18 @@ impl TilePlace {
         }
     }
 
+    /// Calls `f(patch, lane, pixel of the image)` for every pixel inside an image of this width.
+    #[inline(always)]
+    pub(super) fn for_each_pixel(&self, width: usize, mut f: impl FnMut(usize, usize, usize)) {
+        for y in 0..self.height {
+            for x in 0..self.width {
+                let at = (self.y as usize + y) * width + self.x as usize + x;
+                let (patch, lane) = in_plane(x, y);
+                f(patch, lane, at);
+            }
+        }
+    }
+
     /// A plane with 1 inside the image and 0 outside, and a bit for each patch with a pixel inside.
     pub(super) fn inside(&self) -> (Plane, u32) {
         if self.width == TILE && self.height == TILE {
@@ -154,7 +187,7 @@ pub(super) struct Rasterize<'a> {
     pub(super) list: &'a [AtomicU64],
     pub(super) place: TilePlace,
     pub(super) background: [f32; 3],
-    pub(super) depth_plane: DepthPlane,
+    pub(super) depth_plane: DepthPlane<'a>,
     /// The number of pixels in which each row has the largest blend weight, to which the tile adds its pixels; empty
     /// if they are not counted. The counts are integers, so that the order of tiles does not matter.
     pub(super) dominant: &'a [AtomicU32],
@@ -171,7 +204,8 @@ impl WithSimd for Rasterize<'_> {
     fn with_simd<S: Simd>(self, s: S) {
         // Halves or quarters of a patch are processed in pairs, so that common values are loaded once. Depth and
         // dominant pixels, which are rarely needed, share one kernel.
-        let with_extras = self.depth_plane != DepthPlane::Unused || !self.dominant.is_empty();
+        let is_unused = matches!(self.depth_plane, DepthPlane::Unused);
+        let with_extras = !is_unused || !self.dominant.is_empty();
         match (with_extras, matches!(S::F32_LANES, 4 | 8)) {
             (true, true) => self.blend::<S, true, 2>(s),
             (true, false) => self.blend::<S, true, 1>(s),
@@ -186,8 +220,12 @@ impl Rasterize<'_> {
     #[inline(always)]
     #[expect(clippy::too_many_lines, reason = "a numeric kernel")]
     fn blend<S: Simd, const WITH_EXTRAS: bool, const N: usize>(self, s: S) {
-        let counts = self.depth_plane == DepthPlane::BlendedCount;
         let Self { splats, list, place, background, dominant, canvas, blending, batch, .. } = self;
+        let counts = matches!(self.depth_plane, DepthPlane::BlendedCount);
+        let is_inverse = matches!(self.depth_plane, DepthPlane::Inverse | DepthPlane::Distance(_));
+        // Differences from the given depth are added as they are, or as distances.
+        let given = if WITH_EXTRAS { self.depth_plane.given(&place) } else { ZERO_PLANE };
+        let sign = if matches!(self.depth_plane, DepthPlane::Distance(_)) { -1.0 } else { 1.0 };
         let c = |x: f32| V::splat(s, x);
         let (e_min, t_min) = (c(-blending.log2_reach), c(blending.transmittance_min));
         let (zero, never) = (V::zero(s), c(-1.0));
@@ -212,6 +250,11 @@ impl Rasterize<'_> {
                 break;
             }
             batch.set(s, splats, chunk, &place);
+            if WITH_EXTRAS && is_inverse {
+                for splat in &mut batch.splats[..chunk.len()] {
+                    splat.depth = 1.0 / splat.depth;
+                }
+            }
             for p in 0..PATCHES {
                 let reached = batch.splats_of[p];
                 if unfinished >> p & 1 == 0 || reached == 0 {
@@ -229,6 +272,7 @@ impl Rasterize<'_> {
                     let mut g = load_of::<S, N>(s, &green[p][at..]);
                     let mut b = load_of::<S, N>(s, &blue[p][at..]);
                     let mut at_depth = load_of::<S, N>(s, &depth[p][at..]);
+                    let given = load_of::<S, N>(s, &given[p][at..]);
                     let mut w_max = load_of::<S, N>(s, &largest.0[p][at..]);
                     let mut todo = reached;
                     while todo != 0 {
@@ -279,7 +323,8 @@ impl Rasterize<'_> {
                                 at_depth[n] = if counts {
                                     at_depth[n] + zero.lt(w).keep(c(1.0))
                                 } else {
-                                    w.mul_add(c(splat.depth), at_depth[n])
+                                    let difference = c(splat.depth) - given[n];
+                                    w.mul_add(difference.max(difference * sign), at_depth[n])
                                 };
                                 let here = s.splat_u32s(first + i as u32);
                                 let largest_at = &mut largest_at[p][at + n * S::F32_LANES..];

@@ -15,6 +15,11 @@
 //! the pixels of a tile, of q, q·u, q·z, q·u², q·u·z, q·z² with q = α·dL/dα, and of w·g for the colour. The
 //! covariance's gradient is ½·L·M·Lᵀ with M the matrix of second moments; it is never formed, see `project_bwd`.
 //!
+//! Depth is one more channel. The value of a splat with (inverse) depth x in a pixel is m·ρ(x − c) + n·(x − c)², where
+//! ρ is the identity or, with another sign for negative arguments, the absolute value; see [`depth_gradient`]. Nothing
+//! is behind the last splat, so this channel adds nothing to the first b. A gradient with respect to alpha has the same
+//! value for every splat, so it is subtracted from the first b instead.
+//!
 //! Records are summed per row in order of tile number, so that the sum does not depend on the number of threads.
 
 use std::sync::atomic::{AtomicU32, AtomicU64, Ordering::Relaxed};
@@ -23,6 +28,7 @@ use bytemuck::Zeroable;
 use pulp::{Simd, WithSimd};
 
 use super::batch::{BATCH, Batch};
+use super::depth_gradient::{self, DepthChannel};
 use super::project::Splat;
 use super::rasterize::{
     ALPHA_MAX, Aligned, Blending, PATCHES, Plane, TRANSMITTANCE, TileCanvas, TilePlace, ZERO_PLANE,
@@ -54,17 +60,21 @@ mod extra {
     /// The sum of the weighted error, together with [`WEIGHTS`] and [`LARGEST`].
     pub(super) const ERROR: u8 = 8 | WEIGHTS | LARGEST;
     pub(super) const ERROR_ABS: u8 = ERROR | ABS;
-    /// Everything except the error, with the gradients of alpha and depth.
-    pub(super) const ALL: u8 = 16 | ABS | WEIGHTS | LARGEST;
+    /// Everything, with the channel of depth.
+    pub(super) const ALL: u8 = 16 | ERROR_ABS;
 }
 
-/// dL/dpixel of one tile: red, green, blue, alpha, depth. The last two are only read for records with
-/// [`Field::Depth`]; with [`Field::Error`], the last one holds the error of the pixels instead.
+/// dL/dpixel of one tile: red, green, blue, depth; and the error of the pixels. The fourth plane is only read for
+/// records with [`Field::Depth`], the fifth for those with [`Field::Error`].
 #[derive(Debug, Clone)]
 #[repr(C, align(64))]
 pub(super) struct TileGradient {
     pub(super) planes: [Plane; 5],
 }
+
+/// Planes of a [`TileGradient`].
+pub(super) const BY_DEPTH: usize = 3;
+pub(super) const ERROR: usize = 4;
 
 /// Differentiates one tile.
 pub(super) struct RasterizeBwd<'a> {
@@ -78,6 +88,8 @@ pub(super) struct RasterizeBwd<'a> {
     pub(super) canvas: &'a TileCanvas,
     pub(super) upstream: &'a TileGradient,
     pub(super) layout: RecordLayout,
+    /// The meaning of the depth channel, for records with [`Field::Depth`].
+    pub(super) depth: DepthChannel,
     /// The records of this tile's entries; only entries in the current [`Part`](super::records::Part) have one.
     pub(super) records: TileRecords<'a>,
     /// Scratch.
@@ -151,8 +163,10 @@ struct Sums<S: Simd> {
     abs: [V<S>; 2],
     weight: V<S>,
     pixels: V<S>,
-    /// Weights times the last plane of the gradient.
-    map: V<S>,
+    /// Weights times the error of the pixel.
+    error: V<S>,
+    /// Weights times the derivative of the depth channel.
+    by_depth: V<S>,
     weight_max: V<S>,
 }
 
@@ -214,9 +228,12 @@ impl RasterizeBwd<'_> {
     #[expect(clippy::too_many_lines, reason = "a numeric kernel")]
     fn backpropagate<S: Simd, const EXTRAS: u8>(self, s: S) {
         let Self { splats, list, place, background, blending, canvas, upstream, layout, .. } = self;
-        let Self { records, batch, blended, .. } = self;
+        let Self { records, batch, blended, depth, .. } = self;
         let c = |x: f32| V::splat(s, x);
-        let [gr, gg, gb, ga, map] = &upstream.planes;
+        let [gr, gg, gb, by_depth, errors] = &upstream.planes;
+        let [centre, square, by_alpha] =
+            [depth_gradient::CENTRE, depth_gradient::SQUARE, depth_gradient::BY_ALPHA]
+                .map(|plane| &canvas.planes[plane]);
 
         // State per pixel behind the current splat.
         let mut transmittance = Aligned(canvas.planes[TRANSMITTANCE]);
@@ -229,6 +246,7 @@ impl RasterizeBwd<'_> {
                 let b = V::load(s, &gr[p][at..]) * background[0]
                     + V::load(s, &gg[p][at..]) * background[1]
                     + V::load(s, &gb[p][at..]) * background[2];
+                let b = if EXTRAS == extra::ALL { b - V::load(s, &by_alpha[p][at..]) } else { b };
                 b.store(&mut behind[p][at..]);
             }
             *end = canvas.stop[p].iter().copied().max().unwrap_or(0).min(list.len() as u32);
@@ -251,7 +269,7 @@ impl RasterizeBwd<'_> {
             for (i, splat) in batch.splats[..chunk.len()].iter().enumerate().rev() {
                 let mut todo = batch.patches_of[i];
                 let colour = each!(i in 3 => c(splat.colour[i]));
-                let at_depth = c(splat.depth);
+                let at_depth = c(depth.value(splat.depth));
                 let y2_u = c(-splat.l1 * splat.shear);
                 let zero = V::zero(s);
                 let mut sums = Sums {
@@ -259,7 +277,8 @@ impl RasterizeBwd<'_> {
                     abs: [zero; 2],
                     weight: zero,
                     pixels: zero,
-                    map: zero,
+                    error: zero,
+                    by_depth: zero,
                     weight_max: zero,
                 };
                 while todo != 0 {
@@ -280,11 +299,17 @@ impl RasterizeBwd<'_> {
                         );
                         let mut cg = colour[0].mul_add(r, colour[1].mul_add(g, colour[2] * b));
                         if EXTRAS >= extra::ERROR {
-                            let m = V::load(s, &map[p][at..]);
-                            sums.map = w.mul_add(m, sums.map);
-                            if EXTRAS == extra::ALL {
-                                cg = at_depth.mul_add(m, cg + V::load(s, &ga[p][at..]));
-                            }
+                            let error = V::load(s, &errors[p][at..]);
+                            sums.error = w.mul_add(error, sums.error);
+                        }
+                        if EXTRAS == extra::ALL {
+                            let x = at_depth - V::load(s, &centre[p][at..]);
+                            let m = V::load(s, &by_depth[p][at..]);
+                            let slope = x.lt(zero).select(m * depth.sign, m);
+                            let n = V::load(s, &square[p][at..]);
+                            let chord = n.mul_add(x, slope);
+                            cg = x.mul_add(chord, cg);
+                            sums.by_depth = w.mul_add(n.mul_add(x, chord), sums.by_depth);
                         }
                         let old_b = V::load(s, &behind[p][at..]);
                         let cg_minus_b = cg - old_b;
@@ -331,7 +356,11 @@ impl RasterizeBwd<'_> {
                     record[Field::PixelCount.number()] = sums.pixels.sum();
                 }
                 if EXTRAS >= extra::ERROR {
-                    record[Field::Error.number()] = sums.map.sum();
+                    record[Field::Error.number()] = sums.error.sum();
+                }
+                if EXTRAS == extra::ALL {
+                    record[Field::Depth.number()] =
+                        sums.by_depth.sum() * depth.derivative(splat.depth);
                 }
                 if EXTRAS & extra::LARGEST != 0 {
                     record[Field::WeightMax.number()] = sums.weight_max.max_lane();
@@ -364,6 +393,7 @@ pub(super) fn gather(sums: &mut [f32], layout: RecordLayout, records: &[AtomicU3
         12 => gather_all::<12>(sums, maximum, records),
         13 => gather_all::<13>(sums, maximum, records),
         14 => gather_all::<14>(sums, maximum, records),
+        15 => gather_all::<15>(sums, maximum, records),
         _ => gather_all::<{ RecordLayout::MOST }>(sums, maximum, records),
     }
 }
@@ -386,6 +416,4 @@ pub(super) fn gather_all<const STRIDE: usize>(
     sums.copy_from_slice(&total);
 }
 
-const _: () = assert!(BASE == 9 && RecordLayout::MOST == 15, "`gather` lists every length");
-const _: () =
-    assert!(Field::Error.number() == Field::Depth.number(), "depth and error share a value");
+const _: () = assert!(BASE == 9 && RecordLayout::MOST == 16, "`gather` lists every length");

@@ -21,6 +21,7 @@ use crate::signals::{Field, ParameterSignal, RecordLayout, SignalPlanes, value_o
 #[derive(Debug)]
 pub(super) struct Accumulators {
     requested: SignalSet,
+    layout: RecordLayout,
     pub(super) planes: SignalPlanes,
     pub(super) blocks: Blocks,
 }
@@ -129,18 +130,20 @@ impl SignalPlanes {
 }
 
 impl Accumulators {
-    pub(super) fn new(rows: Range<usize>, needs: &Needs) -> Self {
-        let planes = SignalPlanes::new(needs);
-        Self { requested: needs.signals, planes, blocks: Blocks::zeros(rows, planes.count) }
+    /// Accumulators of these rows; `depth` as in [`Setup`](crate::Setup::depth).
+    pub(super) fn new(rows: Range<usize>, needs: &Needs, depth: bool) -> Self {
+        let (requested, planes) = (needs.signals, SignalPlanes::new(needs));
+        let layout = RecordLayout::new(requested, depth);
+        Self { requested, layout, planes, blocks: Blocks::zeros(rows, planes.count) }
     }
 
     pub(super) fn bytes(rows: Range<usize>, needs: &Needs) -> u64 {
         Blocks::<f32>::bytes(rows, SignalPlanes::new(needs).count)
     }
 
-    /// The record layout of the requested signals.
+    /// The record layout of the requested signals, and of depth in the loss.
     pub(super) fn layout(&self) -> RecordLayout {
-        RecordLayout::new(self.requested)
+        self.layout
     }
 
     /// Numbers per row of the buffer that holds summed records in a step and, between steps, the signals being read.

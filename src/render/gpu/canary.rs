@@ -84,6 +84,8 @@ fn run(
             target,
             background: BACKGROUND,
             exposure: None,
+            depth: None,
+            distortion: 0.0,
             sh_degree: 1,
             rates,
             loss_terms: LossTerms::default(),
@@ -120,7 +122,7 @@ impl GpuDevice {
     /// # Errors
     /// As [`GpuBackend::new`].
     pub fn run_canary(&self, needs: &Needs) -> Result<(), BackendError> {
-        self.0.check_once(RecordLayout::new(needs.signals), || check(self, needs))
+        self.0.check_once(RecordLayout::new(needs.signals, false), || check(self, needs))
     }
 }
 

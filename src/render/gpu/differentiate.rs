@@ -65,7 +65,7 @@ impl Differentiable for GpuBackend {
         upstream.assert_size(camera);
         assert_eq!(self.sizes.budget.frozen, 0, "frozen rows have no gradients");
         if !self.sizes.alpha_and_depth {
-            (self.sizes.alpha_and_depth, self.sizes.records) = (true, RecordLayout::ALL);
+            (self.sizes.alpha_and_depth, self.sizes.records) = (true, RecordLayout::DIFFERENTIATED);
             self.rebuild()?;
         }
         self.fit_image(camera.width, camera.height)?;

@@ -68,6 +68,7 @@ impl State {
             entries: self.entries(),
             bands,
             exposure: None,
+            depth: None,
         }
     }
 }

@@ -15,7 +15,7 @@ use densify_core::memory::{Ledger, Section};
 pub(super) fn max_pairs(device: &Device, needs: &Needs) -> u64 {
     // Numbers per pair in the largest buffer that grows with the number of pairs: the records, or else the lists.
     let numbers = match device.accumulation {
-        Accumulation::Slots => RecordLayout::new(needs.signals).stride() as u64,
+        Accumulation::Slots => RecordLayout::new(needs.signals, false).stride() as u64,
         Accumulation::SubgroupCas | Accumulation::SubgroupAtomics => 1,
     };
     let by_binding = device.largest_binding() / (4 * numbers);

@@ -109,7 +109,7 @@ impl Sizes {
         needs: &Needs,
         accumulation: Accumulation,
     ) -> Self {
-        let records = RecordLayout::new(needs.signals);
+        let records = RecordLayout::new(needs.signals, false);
         Self {
             budget,
             cap,

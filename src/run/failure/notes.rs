@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use super::words::model_name;
+use super::words::{load_error, model_name};
 use densify_core::antialiasing::Antialiasing;
 use densify_core::memory::Bytes;
 use densify_core::numbers::grouped;
@@ -62,6 +62,14 @@ pub(crate) fn dataset(s: Spelling, note: &Note) -> String {
             "note: undistortion crops up to {percent:.0} % of each of {photographs} photographs ({} keeps the whole \
              field of view)",
             s.switch("keep_fov")
+        ),
+        Note::DepthLeftOut(error) => {
+            format!("note: the given depth is not used: {}", load_error(error, s))
+        }
+        Note::DepthScalesDiffer { percent } => format!(
+            "note: the scale of the depth differs by {percent:.0} % between views, compared with the points that they \
+             see; if the maps hold inverse depth, {} fits each of them",
+            s.text("depth_unit", "relative")
         ),
     }
 }

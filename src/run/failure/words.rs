@@ -6,7 +6,7 @@ use std::path::Path;
 use densify_core::memory::Bytes;
 use densify_core::numbers::grouped;
 use densify_core::spelling::Spelling;
-use densify_data::{LoadError, LoadRemedy};
+use densify_data::{DepthRemedy, LoadError, LoadRemedy};
 use densify_render::Accumulation;
 
 use super::notes::antialias_option;
@@ -34,7 +34,7 @@ impl Problem {
     }
 }
 
-fn load_error(error: &LoadError, s: Spelling) -> String {
+pub(super) fn load_error(error: &LoadError, s: Spelling) -> String {
     match error {
         LoadError::Data(problem) => problem.clone(),
         LoadError::Remedied { problem, remedy } => {
@@ -60,6 +60,20 @@ fn load_error(error: &LoadError, s: Spelling) -> String {
             )
         }
     }
+}
+
+fn depth_remedy(remedy: DepthRemedy, s: Spelling) -> String {
+    let words = match remedy {
+        DepthRemedy::AddFiles => "add the files".to_owned(),
+        DepthRemedy::Repair => "export the depth again".to_owned(),
+        DepthRemedy::Unit => format!("state the unit with {}", s.option("depth_unit")),
+        DepthRemedy::AlongRay => format!("say so with {}", s.text("depth_along", "ray")),
+        DepthRemedy::AlongAxis => format!("leave {} out", s.text("depth_along", "ray")),
+        DepthRemedy::Relative => format!("fit them with {}", s.text("depth_unit", "relative")),
+        DepthRemedy::NotRelative => format!("state their unit with {}", s.option("depth_unit")),
+        DepthRemedy::Register => "register depth and photographs first".to_owned(),
+    };
+    format!("{words}, or train without depth with {}", s.text("depth", "off"))
 }
 
 fn load_remedy(remedy: LoadRemedy, s: Spelling) -> String {
@@ -92,6 +106,7 @@ fn load_remedy(remedy: LoadRemedy, s: Spelling) -> String {
             "use {} to name a folder that holds cameras and images, as .bin or .txt",
             s.option("sparse"),
         ),
+        LoadRemedy::Depth(remedy) => return depth_remedy(remedy, s),
     };
     words.replace("{}", &option)
 }

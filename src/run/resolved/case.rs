@@ -112,6 +112,7 @@ impl<'a> Case<'a> {
             tracks: decides_exposures,
             colours: true,
             exif: decides_exposures,
+            depth: Some(findings.depth.is_some()),
             tolerance: RESUME_TOLERANCE,
         };
         Self::open(spec, &reading, host, |evidence| {

@@ -15,7 +15,7 @@ use crate::spec::{
 };
 use densify_core::antialiasing::Antialiasing;
 use densify_core::files::{FileError, write_atomically};
-use densify_data::dataset::is_archive;
+use densify_data::dataset::{DepthFinding, is_archive};
 use densify_data::track_colours::Spread;
 use densify_data::track_colours::exposures::ExposureSpread;
 use densify_train::output::{CONFIG_FILE, FolderError};
@@ -60,6 +60,9 @@ pub struct Findings {
     pub init_model: Option<ModelSize>,
     /// The model whose Gaussians never change.
     pub frozen: Option<ModelSize>,
+    /// The given depth that is trained on.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub depth: Option<DepthFinding>,
     /// What the policy's decisions depend on besides densify, such as the version of Python; not in the file of a policy
     /// that is a part of densify.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -172,6 +175,7 @@ impl RunConfig {
             has_exposures: choices.exposure.is_on,
             init_model: inputs.init_model,
             frozen: inputs.frozen_model,
+            depth: inputs.dataset.depth.clone(),
             policy: choices.entry.provenance(),
         };
         Ok(Self {

@@ -62,6 +62,8 @@ pub(super) struct Reading {
     pub(super) colours: bool,
     /// Read the exposures in EXIF.
     pub(super) exif: bool,
+    /// The decision about depth that an earlier session of the run has taken.
+    pub(super) depth: Option<bool>,
     /// Resident memory that is not counted `[bytes]`, so that a resumed run is not refused because its process takes a
     /// little more than the process that started the run.
     pub(super) tolerance: u64,
@@ -77,9 +79,12 @@ impl Inputs {
     ) -> Result<(Self, Evidence), Failure> {
         let observer = host.observer;
         let scene = spec.scene()?;
-        let mut dataset = Dataset::load(scene, &spec.data.load_options(reading.tracks))?;
+        let mut dataset = Dataset::load(scene, &spec.load_options(reading.tracks, reading.depth))?;
         say_notes(observer, &dataset.notes);
         observer.say(format_args!("scene    {}: {}", scene.display(), dataset.describe()));
+        if let Some(depth) = &dataset.depth {
+            observer.say(format_args!("depth    {}", depth.describe()));
+        }
         let usable_points = usable_points(&dataset.points);
         let StartSpec { init, freeze, .. } = &spec.start;
         let init = match init {
@@ -122,7 +127,10 @@ impl Inputs {
 
     /// The same inputs with the photographs at the resolution of `spec`.
     pub(super) fn at_resolution_of(&self, spec: &RunSpec) -> Result<Self, Failure> {
-        let dataset = Dataset::load(spec.scene()?, &spec.data.load_options(false))?;
+        let dataset = Dataset::load(
+            spec.scene()?,
+            &spec.load_options(false, Some(self.dataset.depth.is_some())),
+        )?;
         Ok(Self { images: image_demand(&dataset), dataset, ..self.clone() })
     }
 }

@@ -15,7 +15,7 @@ use densify_core::gaussians::sh_coefficients;
 use densify_core::memory::{Ledger, Section};
 use densify_core::pieces::ROWS_AT_A_TIME;
 use densify_data::dataset::images::ImageDemand;
-use densify_data::dataset::{Dataset, View};
+use densify_data::dataset::{Dataset, DepthSource, View};
 use densify_data::models::{Coordinates, Frame, PLY, Shape};
 use densify_render::{KeptPhotographs, MomentStorage, Setup, Shortcuts, Storage};
 use densify_train::exposure::Exposures;
@@ -59,6 +59,7 @@ impl Case<'_> {
             shortcuts: self.choices.knobs.shortcuts,
             needs,
             exposures: self.choices.exposure.is_on,
+            depth: self.inputs.dataset.depth.is_some() || self.spec.depth.distortion() > 0.0,
             ..Setup::default()
         }
     }
@@ -90,7 +91,10 @@ impl Case<'_> {
         let mut ledger = self.inputs.device.memory_plan(degree, &setup, threads);
         let [train, test] = self.inputs.images;
         let held = train.held(size.image_cache);
-        ledger.add_to(Section::Images, "decoded training views", held);
+        let has_depth = self.inputs.dataset.depth.is_some();
+        let images =
+            if has_depth { "decoded training views with depth" } else { "decoded training views" };
+        ledger.add_to(Section::Images, images, held);
         ledger.add_to(Section::Images, "decoding", train.decoding(DECODERS));
         if needs.least_resolution.is_some() {
             ledger.add_to(Section::Images, "a view at a lower resolution", train.largest);
@@ -206,6 +210,7 @@ impl Case<'_> {
             // Nothing is trained, so moments may be small.
             storage: Storage { moments: MomentStorage::Both8, ..Storage::default() },
             shortcuts: Shortcuts::default(),
+            depth: false,
             ..self.backend_setup(size, geometry::needs())
         };
         let (device, views) = (self.inputs.device.clone(), self.inputs.dataset.test.len());
@@ -244,8 +249,18 @@ impl Case<'_> {
         let views = train.iter().chain(test);
         let rendered = |view: &View| view.source.rendered.as_ref().map_or(0, |image| image.bytes());
         // A view's name and path, in the dataset and again for its images.
-        let view = |view: &View| (3 * size_of::<View>() + 464) as u64 + rendered(view);
-        let expected = PROGRAM + views.map(view).sum::<u64>() + points.len() as u64 * POINT_BYTES;
+        let depth =
+            |view: &View| view.source.depth.as_ref().map_or(0, |depth| 3 * depth.held_bytes());
+        let view = |view: &View| {
+            // A view's depth is counted with the depth, so that runs without depth need no more memory than before it
+            // existed.
+            let bare = size_of::<View>() - size_of::<Option<Box<DepthSource>>>();
+            (3 * bare + 464) as u64 + rendered(view) + depth(view)
+        };
+        let shared = train.iter().find_map(|view| view.source.depth.as_ref());
+        let shared = shared.map_or(0, |depth| depth.shared_bytes());
+        let expected =
+            PROGRAM + views.map(view).sum::<u64>() + points.len() as u64 * POINT_BYTES + shared;
         let program = match self.inputs.resident {
             Some(resident) if resident > expected => resident.next_multiple_of(PROGRAM_STEP),
             _ => expected,

@@ -354,7 +354,9 @@ impl<'a> Session<'a> {
             let record = totals.record(step, report.rows, (run.process.resident)());
             observer.recorded(&record);
             logs.steps.append(&record)?;
-            logs.board.scalars(step, &[("loss", record.loss), ("rows", report.rows as f32)])?;
+            let depth = record.depth.map(|depth| ("depth", depth));
+            let scalars = [("loss", record.loss), ("rows", report.rows as f32)].into_iter();
+            logs.board.scalars(step, &scalars.chain(depth).collect::<Vec<_>>())?;
         }
         Ok(())
     }

@@ -122,7 +122,7 @@ pub(super) fn prepare(
 
 fn train_options(run: &ResolvedRun<'_>, rates: RateOptions) -> TrainOptions {
     let ResolvedRun { case, size, .. } = run;
-    let RunSpec { schedule, data, .. } = case.spec;
+    let RunSpec { schedule, data, depth, .. } = case.spec;
     TrainOptions {
         iterations: schedule.iterations.0,
         seed: schedule.seed,
@@ -134,6 +134,8 @@ fn train_options(run: &ResolvedRun<'_>, rates: RateOptions) -> TrainOptions {
         rates,
         prefetch: AHEAD,
         on_nan: schedule.on_nan,
+        depth: case.inputs.dataset.depth.as_ref().and_then(|_| depth.training()),
+        distortion: depth.distortion(),
     }
 }
 

@@ -41,6 +41,9 @@ struct Window {
     loss: f32,
     l1: f32,
     ssim: f32,
+    /// Sum of the depth terms, and number of steps with one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    depth: Option<(f32, u32)>,
 }
 
 impl Totals {
@@ -68,22 +71,27 @@ impl Totals {
         while self.drawn.len() > views {
             self.drawn.pop_front();
         }
-        let Window { steps, loss, l1, ssim } = &mut self.window;
+        let Window { steps, loss, l1, ssim, depth } = &mut self.window;
         *steps = steps.saturating_add(1);
         *loss += output.loss;
         *l1 += output.l1;
         *ssim += output.ssim;
+        if let Some(term) = output.depth {
+            let (sum, count) = depth.unwrap_or_default();
+            *depth = Some((sum + term, count.saturating_add(1)));
+        }
     }
 
     /// The means since the last record.
     pub(super) fn record(&mut self, step: u32, rows: usize, resident: Option<u64>) -> StepRecord {
-        let Window { steps, loss, l1, ssim } = std::mem::take(&mut self.window);
+        let Window { steps, loss, l1, ssim, depth } = std::mem::take(&mut self.window);
         let steps = steps as f32;
         StepRecord {
             step,
             loss: loss / steps,
             l1: l1 / steps,
             ssim: ssim / steps,
+            depth: depth.map(|(sum, count)| sum / count as f32),
             rows,
             seconds: self.wall.as_secs_f64(),
             resident_bytes: resident,

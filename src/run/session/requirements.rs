@@ -10,8 +10,10 @@ use densify_core::files::FileError;
 use densify_core::gaussians::MAX_SH_DEGREE;
 use densify_core::numbers::counted;
 use densify_core::spelling::Spelling;
+use densify_data::dataset::DepthFinding;
+use densify_render::DepthTerm;
 use densify_train::output::read_json;
-use densify_train::trainer::{AutoBudget, MIN_GAIN};
+use densify_train::trainer::{Annealed, AutoBudget, MIN_GAIN};
 
 /// Path within the folder of the run.
 pub(super) const REQUIREMENTS: &str = "stats/requirements.json";
@@ -33,8 +35,23 @@ pub struct Requirements {
     pub rows: Option<AutoBudget>,
     /// Number of training views not rendered for scores because of near-duplicates.
     pub unscored_views: usize,
+    /// The given depth that was trained on.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub depth: Option<DepthUse>,
     /// The automatic reductions; reductions that options ask for are not among them.
     pub left_out: Vec<LeftOut>,
+}
+
+/// The given depth of a run, and its part in the loss.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct DepthUse {
+    /// The depth, and how it agrees with the points.
+    #[serde(flatten)]
+    pub given: DepthFinding,
+    /// The term of the loss.
+    pub term: DepthTerm,
+    /// Weight of the term, at the first and at the last iteration.
+    pub weight: Annealed,
 }
 
 /// The reductions in a `stats/requirements.json`.
@@ -90,20 +107,27 @@ impl Requirements {
             exposures_from: config.resolved.exposure_from,
             rows: auto_budget.cloned(),
             unscored_views,
+            depth: config.resolved.depth.clone().and_then(|given| {
+                let training = config.spec.depth.training()?;
+                Some(DepthUse { given, term: training.term, weight: training.weight })
+            }),
             left_out: left_out.into_iter().flatten().collect(),
         }
     }
 
     /// The report in a few lines.
     pub fn lines(&self, spelling: Spelling) -> Vec<String> {
+        let depth = self.depth.as_ref().map(|depth| {
+            format!("trained on depth with weight {}: {}", depth.weight, depth.given.describe())
+        });
         if self.left_out.is_empty() {
             let full = spelling.switch("full");
             let why = if self.full { format!(" ({full})") } else { String::new() };
-            return vec![format!("left out nothing{why}")];
+            return std::iter::once(format!("left out nothing{why}")).chain(depth).collect();
         }
         let line =
             |left: &LeftOut| format!("left out {}: {}; {}", left.what, left.evidence, left.loss);
-        self.left_out.iter().map(line).collect()
+        self.left_out.iter().map(line).chain(depth).collect()
     }
 }
 

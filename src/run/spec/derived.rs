@@ -9,10 +9,11 @@ use toml::{Table, Value};
 
 use super::knobs::Knobs;
 use super::values;
-use super::{DataSpec, InitChoice, RunSpec};
+use super::{DataSpec, DepthSpec, InitChoice, RunSpec};
 use crate::failure::{Failure, OptionProblem};
-use densify_data::dataset::{LoadOptions, Split, builtin};
+use densify_data::dataset::{DepthChoice, DepthOptions, LoadOptions, Split, builtin};
 use densify_train::schedule::{InitRates, RateOptions};
+use densify_train::trainer::DepthTraining;
 
 impl DataSpec {
     /// The options for reading the dataset, with or without tracks.
@@ -33,11 +34,46 @@ impl DataSpec {
             mask_mode: self.mask_mode,
             cache: builtin::cache_folder().filter(|_| !self.no_cache),
             tracks,
+            depth: DepthOptions::default(),
         }
     }
 }
 
+impl DepthSpec {
+    /// The use of the depth in training; `None` if it has no weight.
+    pub(crate) fn training(&self) -> Option<DepthTraining> {
+        let default = DepthTraining::default();
+        let weight = self.depth_weight.unwrap_or(default.weight);
+        let term = self.depth_term.unwrap_or(default.term);
+        (!weight.is_zero()).then_some(DepthTraining { weight, term })
+    }
+
+    /// Weight of the distortion term.
+    pub(crate) fn distortion(&self) -> f32 {
+        self.distortion_weight.map_or(0.0, |weight| weight.0 as f32)
+    }
+}
+
 impl RunSpec {
+    /// The options for reading the dataset with its depth, with or without tracks. `is_known` is the decision about
+    /// depth that an earlier session of the run has taken.
+    pub(crate) fn load_options(&self, tracks: bool, is_known: Option<bool>) -> LoadOptions {
+        let DepthSpec { depth, depth_unit, depth_along, depth_points, .. } = &self.depth;
+        let choice = match is_known {
+            _ if self.depth.training().is_none() => DepthChoice::Off,
+            Some(true) => DepthChoice::On,
+            Some(false) => DepthChoice::Off,
+            None => depth.unwrap_or(DepthChoice::Auto),
+        };
+        let depth = DepthOptions {
+            choice,
+            unit: *depth_unit,
+            along: depth_along.unwrap_or_default(),
+            points: depth_points.as_ref().map(|file| file.0.clone()),
+        };
+        LoadOptions { depth, ..self.data.load_options(tracks) }
+    }
+
     /// The options as the table of a file, without those that are `None`.
     ///
     /// # Errors

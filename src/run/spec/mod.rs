@@ -15,7 +15,7 @@ pub use overlay::Partial;
 pub(crate) use values::assignments;
 pub use values::{
     AbsolutePath, Assignment, Budget, ByteCount, Fraction, ImageCache, InitChoice, PolicyFile,
-    Rows, ShDegree, Threads, Whole,
+    Rows, ShDegree, Threads, Weight, Whole,
 };
 
 use std::num::NonZeroU32;
@@ -26,12 +26,12 @@ use serde::{Deserialize, Serialize};
 
 use densify_core::antialiasing::Antialiasing;
 use densify_core::spelling::Spelling;
-use densify_data::dataset::{FarCameras, MaskMode, Resolution};
+use densify_data::dataset::{DepthAlong, DepthChoice, DepthUnit, FarCameras, MaskMode, Resolution};
 use densify_data::models::Coordinates;
-use densify_render::BackendChoice;
+use densify_render::{BackendChoice, DepthTerm};
 use densify_train::exposure::{ExposureChoice, ExposureModel};
 use densify_train::schedule::{Background, InitRates, REFERENCE_ITERATIONS};
-use densify_train::trainer::OnNan;
+use densify_train::trainer::{Annealed, OnNan};
 use values::as_table;
 
 /// Rule for changing an option of a resumed run.
@@ -168,6 +168,42 @@ run_spec! {
         /// Background of the scene, and of transparent images: black, white, random (another colour at every step) or
         /// #rrggbb
         background: Background = Background::Black, Fixed, value "COLOUR";
+    }
+
+    /// Depth given beside the photographs, and terms of the loss that need none.
+    depth: DepthSpec, "Depth" {
+        /// Use of depth maps that the dataset has: files named by depth_file_path in transforms.json; depth/ or depths/
+        /// with the names of the photographs (16-bit PNG, .npy, .exr), and confidence/ beside them; COLMAP's
+        /// stereo/depth_maps, and depths/ with sparse/0/depth_params.json (default: auto)
+        ///
+        /// Depth is checked against the points that the views see: errors in scale of 2 to 20 % are corrected; larger
+        /// ones, distances along rays, inverse depth and shifted maps are refused. 0 and non-finite values are unknown,
+        /// not sky
+        depth: Option<DepthChoice> = None, Fixed, value "WHEN";
+
+        /// Length of one step of the values in the dataset's units, such as 0.001, 1/5000 (TUM) or 1/6553.5 (Replica);
+        /// relative: inverse depth up to scale and offset, as monocular networks estimate it, which are fitted to the
+        /// points that each view sees (default: 0.001 for PNG and .npy, 1 for .exr and COLMAP)
+        depth_unit: Option<DepthUnit> = None, Fixed, value "UNIT";
+
+        /// What the values measure (default: axis)
+        depth_along: Option<DepthAlong> = None, Fixed, value "WHICH";
+
+        /// Point cloud in the dataset's coordinates (PLY, LAS or LAZ), such as a laser scan, to be projected into the views
+        /// instead of reading depth maps. If the dataset has no points, training starts from these
+        depth_points: Option<AbsolutePath> = None, Fixed, value "FILE";
+
+        /// Weight of the depth term, at the first and at the last iteration; one number: the same throughout (default:
+        /// 0.05:0.001)
+        depth_weight: Option<Annealed> = None, Fixed, value "FIRST:LAST";
+
+        /// Term that compares depth: expected compares the mean inverse depth along a ray, samples that of each Gaussian
+        /// (default: expected)
+        depth_term: Option<DepthTerm> = None, Fixed, value "TERM";
+
+        /// Weight of a term that gathers the Gaussians along each ray, after a third of the run; needs no given depth
+        /// (default: 0)
+        distortion_weight: Option<Weight> = None, Fixed, value "WEIGHT";
     }
 
     /// The dataset, and the first Gaussians.

@@ -31,6 +31,10 @@ pub enum ImageCache {
 #[derive(Debug, Clone, Copy, PartialEq, PartialOrd, Serialize)]
 pub struct Fraction(pub f64);
 
+/// A finite number, at least 0.
+#[derive(Debug, Clone, Copy, PartialEq, PartialOrd, Serialize)]
+pub struct Weight(pub f64);
+
 /// A whole number from `LEAST` to `MOST`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 pub struct Whole<const LEAST: u32, const MOST: u32>(pub u32);
@@ -160,6 +164,15 @@ impl<const LEAST: u32, const MOST: u32> FromStr for Whole<LEAST, MOST> {
     }
 }
 
+impl FromStr for Weight {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let weight = text.parse().ok().filter(|weight: &f64| weight.is_finite() && *weight >= 0.0);
+        weight.map(Self).ok_or_else(|| format!("`{text}` must be a number from 0"))
+    }
+}
+
 impl FromStr for Budget {
     type Err = String;
 
@@ -284,6 +297,7 @@ number_or_text! {
     [] ByteCount;
     [] ImageCache;
     [] Fraction;
+    [] Weight;
     [const LEAST: u32, const MOST: u32] Whole<LEAST, MOST>;
     [] Budget;
     [] ShDegree;

@@ -5,19 +5,25 @@ use std::path::{Path, PathBuf};
 
 use image::{DynamicImage, ImageBuffer, Luma};
 
-use densify_core::files::FileError;
+use densify_core::files::{FileError, write_atomically};
 use densify_core::image::Image8;
 use densify_data::dataset::normalise::Normalisation;
 use densify_render::Rendering;
 use densify_train::output::write_json;
 use densify_train::pictures::{photograph, picture, side_by_side, to_u8, write_png};
 
+/// Opacity below which a pixel has no depth.
+const OPAQUE: f32 = 0.5;
+/// The usual unit of depth pictures, thousandths, and the number of steps below which it is coarse.
+const USUAL_UNIT: f64 = 0.001;
+const COARSE_STEPS: f64 = 1000.0;
+
 /// The pictures that are written for each rendering in addition to its colours.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Channels {
     /// Opacity, as `NAME.alpha.png`.
     pub alpha: bool,
-    /// Depth in 16 bits, as `NAME.depth.png`; 65535 stands for the largest depth of the picture.
+    /// [Depth](mean_depth) in 16 bits, as `NAME.depth.png`, and in f32, as `NAME.depth.npy`.
     pub depth: bool,
 }
 
@@ -28,8 +34,8 @@ pub struct PictureFolder {
     channels: Channels,
     /// Number of the dataset's units per scene unit.
     units: f64,
-    /// The largest depth of each depth picture, in the dataset's units.
-    largest_depth: BTreeMap<String, f64>,
+    /// One step of each depth picture, in the dataset's units.
+    depth_units: BTreeMap<String, f64>,
 }
 
 impl PictureFolder {
@@ -37,7 +43,7 @@ impl PictureFolder {
     /// units of the dataset.
     pub fn new(folder: &Path, channels: Channels, normalisation: &Normalisation) -> Self {
         let units = 1.0 / normalisation.scale;
-        Self { folder: folder.to_owned(), channels, units, largest_depth: BTreeMap::new() }
+        Self { folder: folder.to_owned(), channels, units, depth_units: BTreeMap::new() }
     }
 
     /// The folder.
@@ -56,10 +62,13 @@ impl PictureFolder {
             write_png(&file(".alpha.png"), &alpha(rendering))?;
         }
         if self.channels.depth {
-            let (png, largest) = depth(rendering);
+            let depth = mean_depth(rendering, self.units);
+            let (width, height) = (rendering.width, rendering.height);
+            let (png, unit) = depth_picture((width, height), &depth);
             write_png(&file(".depth.png"), &png)?;
-            let largest = f64::from(largest) * self.units;
-            self.largest_depth.insert(format!("{name}.depth.png"), largest);
+            let array = npy((width, height), &depth);
+            write_atomically(&file(".depth.npy"), |out| out.write_all(&array))?;
+            self.depth_units.insert(format!("{name}.depth.png"), unit);
         }
         Ok(())
     }
@@ -79,17 +88,18 @@ impl PictureFolder {
         write_png(&path, &pair(image, background, rendering))
     }
 
-    /// Writes the scales of the depth pictures to `depth.json`, if there are depth pictures.
+    /// Writes the units of the depth pictures to `depth.json`, if there are depth pictures.
     ///
     /// # Errors
     /// When the file cannot be written.
     pub fn finish(&self) -> Result<(), FileError> {
-        if self.largest_depth.is_empty() {
+        if self.depth_units.is_empty() {
             return Ok(());
         }
         let scale = serde_json::json!({
-            "what": "depth = value / 65535 * largest, in the dataset's own units",
-            "largest": self.largest_depth,
+            "what": "mean depth along the optical axis in the dataset's own units: values of .npy, and values of .png \
+                     times their unit; 0 where the opacity is below one half",
+            "unit": self.depth_units,
         });
         write_json(&self.folder.join("depth.json"), &scale)
     }
@@ -131,17 +141,50 @@ fn alpha(rendering: &Rendering) -> DynamicImage {
     ImageBuffer::from_fn(*width, *height, pixel).into()
 }
 
-/// Depth relative to its largest value, and that value `[scene units]`.
-fn depth(rendering: &Rendering) -> (DynamicImage, f32) {
-    let Rendering { width, height, depth, .. } = rendering;
-    let largest = depth.iter().copied().fold(0.0, f32::max);
-    let scale = if largest > 0.0 { 65_535.0 / largest } else { 0.0 };
-    let pixel = |x: u32, y: u32| {
-        let value = depth[y as usize * *width as usize + x as usize];
-        Luma([(value * scale).round() as u16])
+/// Mean depth of each pixel, Σ α·T·z / Σ α·T, times `units`; 0 where the opacity Σ α·T is below one half. `eval`
+/// measures the same depth.
+pub fn mean_depth(rendering: &Rendering, units: f64) -> Vec<f32> {
+    let mean = |(&depth, &alpha): (&f32, &f32)| {
+        if alpha < OPAQUE { 0.0 } else { (f64::from(depth) / f64::from(alpha) * units) as f32 }
     };
-    let image: ImageBuffer<Luma<u16>, Vec<u16>> = ImageBuffer::from_fn(*width, *height, pixel);
-    (image.into(), largest)
+    rendering.depth.iter().zip(&rendering.alpha).map(mean).collect()
+}
+
+/// Depth in 16 bits, and one step of it: a thousandth, or the power of ten that fits, if the depths are larger than 65
+/// or so small that a thousandth would be coarse.
+fn depth_picture((width, height): (u32, u32), depth: &[f32]) -> (DynamicImage, f64) {
+    let largest = f64::from(depth.iter().copied().filter(|z| z.is_finite()).fold(0.0, f32::max));
+    let fits = |unit: f64| largest <= 65_535.0 * unit;
+    let unit = if largest > 0.0 {
+        let unit = 10_f64.powf((largest / 65_535.0).log10().ceil());
+        // Rounding may have made it too small.
+        if fits(unit) { unit } else { 10.0 * unit }
+    } else {
+        USUAL_UNIT
+    };
+    let is_usual = fits(USUAL_UNIT) && largest >= COARSE_STEPS * USUAL_UNIT;
+    let unit = if is_usual { USUAL_UNIT } else { unit };
+    let pixel = |x: u32, y: u32| {
+        let value = f64::from(depth[y as usize * width as usize + x as usize]);
+        Luma([(value / unit).round() as u16])
+    };
+    let image: ImageBuffer<Luma<u16>, Vec<u16>> = ImageBuffer::from_fn(width, height, pixel);
+    (image.into(), unit)
+}
+
+/// A NumPy array of shape `[height, width]` (numpy.org/doc/stable/reference/generated/numpy.lib.format.html).
+fn npy((width, height): (u32, u32), values: &[f32]) -> Vec<u8> {
+    // Size of magic, version and length.
+    const PREFIX: usize = 10;
+    let header =
+        format!("{{'descr': '<f4', 'fortran_order': False, 'shape': ({height}, {width}), }}");
+    // The header is padded to a multiple of 64 bytes, including its line end.
+    let padded = (PREFIX + header.len() + 1).next_multiple_of(64) - PREFIX;
+    let mut bytes = b"\x93NUMPY\x01\x00".to_vec();
+    bytes.extend((padded as u16).to_le_bytes());
+    bytes.extend(format!("{header:0$}\n", padded - 1).bytes());
+    bytes.extend(values.iter().flat_map(|value| value.to_le_bytes()));
+    bytes
 }
 
 /// The photograph on the left, the rendering on the right.
@@ -176,11 +219,37 @@ mod tests {
     fn pixels_are_rounded_and_clamped() {
         assert_eq!(picture(&rendering()).into_raw(), [0, 128, 255, 0, 255, 0]);
         assert_eq!(alpha(&rendering()).into_luma8().into_raw(), [255, 51]);
-        let (png, largest) = depth(&rendering());
-        assert_eq!(png.into_luma16().into_raw(), [65_535, 16_384]);
-        assert!((largest - 4.0).abs() < f32::EPSILON);
-        let empty = Rendering { depth: vec![0.0; 2], ..rendering() };
-        assert_eq!(depth(&empty).0.into_luma16().into_raw(), [0, 0]);
+    }
+
+    #[test]
+    fn depth_is_the_mean_of_opaque_pixels_in_a_stated_unit() {
+        let half = Rendering { alpha: vec![0.5, 0.2], ..rendering() };
+        let depth = mean_depth(&half, 3.0);
+        assert_eq!(depth, [24.0, 0.0]);
+        let steps = |depth: [f32; 2]| {
+            let (png, unit) = depth_picture((2, 1), &depth);
+            (png.into_luma16().into_raw(), unit)
+        };
+        for (depth, values, unit) in [
+            ([24.0, 0.0], [24_000, 0], 0.001),
+            ([65.535, 1.0], [65_535, 1000], 0.001),
+            ([66.0, 1.0], [6600, 100], 0.01),
+            ([0.5, 0.0], [50_000, 0], 1e-5),
+            ([0.0, 0.0], [0, 0], 0.001),
+        ] {
+            let (found, found_unit) = steps(depth);
+            assert_eq!(found, values, "{depth:?}");
+            assert!((found_unit / unit - 1.0).abs() < 1e-9, "{found_unit} for {depth:?}");
+        }
+    }
+
+    #[test]
+    fn arrays_have_an_aligned_header_and_all_values() {
+        let bytes = npy((3, 2), &[1.0, 2.0, 3.0, 4.0, 5.0, 6.0]);
+        assert_eq!(bytes.len() % 64, 24);
+        let header = String::from_utf8_lossy(&bytes[10..bytes.len() - 24]);
+        assert!(header.contains("'shape': (2, 3)") && header.ends_with('\n'), "{header}");
+        assert_eq!(bytes[bytes.len() - 4..], 6.0_f32.to_le_bytes());
     }
 
     #[test]

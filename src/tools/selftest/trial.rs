@@ -214,6 +214,8 @@ pub(super) fn step(
         target,
         background,
         exposure: None,
+        depth: None,
+        distortion: 0.0,
         sh_degree,
         rates: RATES,
         loss_terms: LossTerms::default(),

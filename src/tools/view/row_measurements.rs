@@ -84,6 +84,8 @@ impl RowMeasurements {
                 target: &image,
                 background: scene.background,
                 exposure: None,
+                depth: None,
+                distortion: 0.0,
                 sh_degree,
                 rates: LearningRates::default(),
                 loss_terms: LossTerms::default(),

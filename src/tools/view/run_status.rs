@@ -220,7 +220,16 @@ mod tests {
 
     fn record(step: u32) -> StepRecord {
         let (loss, rows) = (1.0 / step as f32, step as usize);
-        StepRecord { step, loss, l1: 0.0, ssim: 0.0, rows, seconds: 1.0, resident_bytes: None }
+        StepRecord {
+            step,
+            loss,
+            l1: 0.0,
+            ssim: 0.0,
+            depth: None,
+            rows,
+            seconds: 1.0,
+            resident_bytes: None,
+        }
     }
 
     #[test]

@@ -66,6 +66,9 @@ impl ViewsFingerprint {
             cameras.add(format_args!("{camera:?}"));
             let mask = source.mask.as_ref().map(|mask| mask.file.length());
             images.add(format_args!("{:?}{mask:?}{:?}", source.header, source.undistortion));
+            if let Some(depth) = &source.depth {
+                images.add(format_args!("{}", depth.fingerprint()));
+            }
             if let Some(image) = &source.rendered {
                 for pixels in [Some(&image.rgb), image.alpha.as_ref(), image.mask.as_ref()] {
                     images.0 = crc32c::crc32c_append(images.0, pixels.map_or(&[], |p| &p[..]));

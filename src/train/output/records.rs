@@ -100,6 +100,10 @@ pub struct StepRecord {
     pub l1: f32,
     /// Mean structural similarity over the same steps.
     pub ssim: f32,
+    /// Mean [depth term](densify_render::DepthTerm), without its weight, over those of the same steps whose views have
+    /// depth.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub depth: Option<f32>,
     /// Number of rows.
     pub rows: usize,
     /// Wall time since the first step `[s]`.

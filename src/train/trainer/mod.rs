@@ -5,6 +5,7 @@
 //! optimiser, and then an edit if the policy is due. Policies see the model after the optimiser's step.
 
 mod auto_budget;
+mod depth;
 mod edit;
 mod error;
 mod near_duplicates;
@@ -28,8 +29,11 @@ use crate::exposure::Exposures;
 use crate::schedule;
 pub use auto_budget::{AutoBudget, Interval, MIN_GAIN, Removal, growth_signals};
 use densify_core::image::SharedImage;
-use densify_data::views::ViewSource;
+use densify_core::image::depth::SharedDepth;
+use densify_data::views::{ViewError, ViewSource};
 use densify_render::{Backend, StepInput};
+use depth::distortion;
+pub use depth::{Annealed, DepthTraining};
 use error::AtStep;
 pub use error::TrainError;
 use near_duplicates::distinct_views;
@@ -140,15 +144,17 @@ impl<V: ViewSource> Trainer<V> {
         let view = self.next_view();
         let start = Instant::now();
         // The image is read first, so that an error leaves the state after the last step unchanged.
-        let image = self.image(step, view)?;
+        let (image, depth) = self.image_with_depth(step, view)?;
         if (self.state.step as usize).is_multiple_of(self.views.count()) {
             self.backend.begin_epoch();
         }
         self.images_time = self.images_time.saturating_add(start.elapsed());
         let cadence = self.cadence(step)?;
         let (loss_terms, noise) = self.terms(step)?;
-        let (camera, image) = self.at_resolution(step, view, image)?;
+        let (camera, image, depth) = self.at_resolution(step, view, image, depth)?;
         let TrainOptions { iterations, seed, background, rates, .. } = self.options;
+        let progress = f64::from(step) / f64::from(iterations);
+        let depth = self.options.depth.zip(depth.as_deref());
         let exposure = self.state.exposures.as_ref().map(|exposures| exposures.transform(view));
         let input = StepInput {
             step,
@@ -157,6 +163,8 @@ impl<V: ViewSource> Trainer<V> {
             target: &image,
             background: background.at(seed, step),
             exposure: exposure.as_ref(),
+            depth: depth.and_then(|(training, map)| training.target(map, progress)),
+            distortion: distortion(self.options.distortion, progress),
             sh_degree: self.sh_degree(step),
             rates: rates.at(step, iterations, self.scene.extent),
             loss_terms,
@@ -171,7 +179,7 @@ impl<V: ViewSource> Trainer<V> {
             return Err(TrainError::Diverged { step, view, loss: output.loss });
         }
         if let Some((exposures, gradient)) = self.state.exposures.as_mut().zip(output.exposure) {
-            exposures.step(view, &gradient, f64::from(step) / f64::from(iterations));
+            exposures.step(view, &gradient, progress);
         }
         let is_due = self.ask_policy(step, |policy| policy.is_due(step))?;
         let mut events = Vec::new();
@@ -194,11 +202,21 @@ impl<V: ViewSource> Trainer<V> {
     }
 
     fn image(&self, step: u32, view: usize) -> Result<SharedImage, TrainError> {
-        self.views.image(view).map_err(|source| TrainError::View {
-            step,
-            view: self.views.name(view).to_owned(),
-            source,
-        })
+        self.views.image(view).map_err(|source| self.view_error(step, view, source))
+    }
+
+    /// The image of a view, and its depth if it is trained on.
+    fn image_with_depth(
+        &self,
+        step: u32,
+        view: usize,
+    ) -> Result<(SharedImage, Option<SharedDepth>), TrainError> {
+        let loaded = self.views.image_with_depth(view);
+        loaded.map_err(|source| self.view_error(step, view, source))
+    }
+
+    fn view_error(&self, step: u32, view: usize, source: ViewError) -> TrainError {
+        TrainError::View { step, view: self.views.name(view).to_owned(), source }
     }
 
     /// The optimiser's cadence at this step, according to the policy.

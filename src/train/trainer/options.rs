@@ -2,6 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::depth::DepthTraining;
 use crate::schedule::{Background, RateOptions};
 
 /// Options of training, in addition to the scene and the policy.
@@ -26,6 +27,11 @@ pub struct TrainOptions {
     pub prefetch: usize,
     /// Treatment of rows with non-finite values.
     pub on_nan: OnNan,
+    /// The use of depth that views have; requires a backend [set up](densify_render::Setup::depth) for depth.
+    pub depth: Option<DepthTraining>,
+    /// Weight of the [distortion term](densify_render::StepInput::distortion) after a third of the run, >= 0; requires
+    /// a backend set up for depth unless it is 0.
+    pub distortion: f32,
 }
 
 /// Automatic choices from measurements of the scene.

@@ -10,28 +10,31 @@ use densify_policies::policy::PolicyError;
 use super::{TrainError, Trainer};
 use densify_core::camera::Camera;
 use densify_core::image::SharedImage;
+use densify_core::image::depth::SharedDepth;
 use densify_data::views::ViewSource;
 
 /// Smallest side of shrunk images `[px]`, because nothing could be learned from smaller images.
 const MIN_SIDE: u32 = 16;
 
 impl<V: ViewSource> Trainer<V> {
-    /// A view's camera and image at the resolution that the policy requests for this step.
+    /// A view's camera, image and depth at the resolution that the policy requests for this step.
     pub(super) fn at_resolution(
         &self,
         step: u32,
         view: usize,
         image: SharedImage,
-    ) -> Result<(Camera, SharedImage), TrainError> {
+        depth: Option<SharedDepth>,
+    ) -> Result<(Camera, SharedImage, Option<SharedDepth>), TrainError> {
         let scale = self.ask_policy(step, |policy| policy.resolution(step))?;
         let checked = self.needs.check_resolution(scale).map_err(PolicyError::Other);
         checked.map_err(|error| self.policy_error(step, error))?;
         let camera = *self.views.camera(view);
         let (width, height) = shrunk((camera.width, camera.height), scale);
         if (width, height) == (camera.width, camera.height) {
-            return Ok((camera, image));
+            return Ok((camera, image, depth));
         }
-        Ok((camera.resized(width, height), Arc::new(image.shrunk(width, height))))
+        let depth = depth.map(|depth| Arc::new(depth.shrunk(width, height)));
+        Ok((camera.resized(width, height), Arc::new(image.shrunk(width, height)), depth))
     }
 }
 

@@ -22,7 +22,8 @@ fn a_camera_path_is_rendered_as_frames_and_video() {
     let options = "--path orbit --frames 5 --size 31x20 --depth --fps 8";
     call_with(&format!("{options} --video {}", text(&video))).ok();
     let names: Vec<String> = files(&frames).into_keys().collect();
-    let expected = (0..5).flat_map(|n| ["depth.png", "png"].map(|e| format!("frame_{n:05}.{e}")));
+    let expected =
+        (0..5).flat_map(|n| ["depth.npy", "depth.png", "png"].map(|e| format!("frame_{n:05}.{e}")));
     let expected: Vec<String> = ["depth.json".to_owned()].into_iter().chain(expected).collect();
     assert_eq!(names, expected);
     assert_eq!(size(&frames, "frame_00004.png"), (31, 20));

@@ -124,7 +124,9 @@ fn render_writes_images_of_the_views() {
         ["alpha", "depth", "pair"].map(|kind| format!("{view}.{kind}.png")).into_iter()
     };
     let mut expected: Vec<String> = maps("view_00").chain(maps("view_08")).collect();
+    let arrays = ["view_00.depth.npy", "view_08.depth.npy"];
     expected.extend(["view_00.png", "view_08.png", "depth.json"].map(str::to_owned));
+    expected.extend(arrays.map(str::to_owned));
     expected.sort();
     assert_eq!(names, expected);
     for kind in ["png", "alpha.png", "depth.png"] {
@@ -132,10 +134,20 @@ fn render_writes_images_of_the_views() {
     }
     assert_eq!(size(&pictures, "view_08.pair.png"), (2 * SIZE.0, SIZE.1));
     let open = |name: &str| image::open(pictures.join(name)).expect("a picture");
-    assert!(matches!(open("view_00.depth.png"), image::DynamicImage::ImageLuma16(_)));
+    let image::DynamicImage::ImageLuma16(steps) = open("view_00.depth.png") else {
+        panic!("depth has sixteen bits");
+    };
     // The scene has opaque blobs four dataset units away.
-    let depth = json(&pictures.join("depth.json"));
-    let largest = depth["largest"]["view_00.depth.png"].as_f64().expect("a number");
+    let unit = json(&pictures.join("depth.json"))["unit"]["view_00.depth.png"].as_f64();
+    let unit = unit.expect("a number");
+    let array = std::fs::read(pictures.join(arrays[0])).unwrap();
+    let values = &array[array.len() - 4 * steps.len()..];
+    let values = values.chunks_exact(4).map(|z| f32::from_le_bytes([z[0], z[1], z[2], z[3]]));
+    let mut largest = 0.0_f64;
+    for (step, value) in steps.as_raw().iter().zip(values.map(f64::from)) {
+        assert!((f64::from(*step) * unit - value).abs() <= 0.51 * unit, "{step} for {value}");
+        largest = largest.max(value);
+    }
     assert!((3.0..6.0).contains(&largest), "{largest}");
     // The pair shows the photograph on the left and the rendering on the right.
     let pair = open("view_00.pair.png").into_rgb8();

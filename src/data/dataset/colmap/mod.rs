@@ -13,6 +13,7 @@ use std::path::{Path, PathBuf};
 
 use glam::{DMat3, DVec3};
 
+use super::depth::add_params;
 use super::folders::Folders;
 use super::formats::DatasetFormat;
 use super::lens::Lens;
@@ -198,6 +199,7 @@ fn read(root: &Root, options: &LoadOptions) -> Result<Option<Scene>, LoadError> 
         let found = folders.image(named)?.ok_or_else(|| folders.missing(named))?;
         reduced_missing += usize::from(found.fell_back);
         let mask = folders.mask(&found, named, &photographs)?;
+        let depth = folders.depth(&found, named)?;
         frames.push(Frame {
             name: found.name,
             id: Some(image.id),
@@ -206,6 +208,7 @@ fn read(root: &Root, options: &LoadOptions) -> Result<Option<Scene>, LoadError> 
             image: found.path,
             reduced: found.reduced,
             mask,
+            depth,
             lens: *lens,
             header: None,
             rotation: image.rotation,
@@ -230,6 +233,9 @@ fn read(root: &Root, options: &LoadOptions) -> Result<Option<Scene>, LoadError> 
     if reduced_missing > 0 {
         notes.push(Note::Text(folders.fell_back_note(reduced_missing)));
     }
+    let mut texts = Vec::new();
+    add_params(root, &chosen.folder, &mut frames, &mut texts)?;
+    notes.extend(text_notes(texts));
     let mut own_split = false;
     if options.split == Split::Eval {
         let mut texts = Vec::new();

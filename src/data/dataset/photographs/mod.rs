@@ -10,6 +10,7 @@ use glam::{DMat3, DVec2};
 use image::GrayImage;
 use rayon::prelude::*;
 
+use super::depth::DepthSource;
 use super::exif::Exif;
 use super::images::{self, Hides, ImageHeader, ImageSource, Mask, SourceFile};
 use super::lens::{Lens, PinholeError, Pinholes};
@@ -29,6 +30,8 @@ pub(super) struct Photograph {
     pub(super) held_out: bool,
     /// Id of the photograph in tracks.
     pub(super) id: Option<u32>,
+    /// Fault of the depth that was found for the photograph.
+    pub(super) depth_fault: Option<LoadError>,
 }
 
 /// The photographs of frames, in the same order and in the dataset's own coordinates.
@@ -159,6 +162,13 @@ fn photograph(
         Ok::<_, LoadError>(Mask { file, hides, mode: options.mask_mode })
     });
     let mask = mask.transpose()?;
+    let depth =
+        frame.depth.as_ref().map(|found| DepthSource::of_file(found, header, &options.depth));
+    let (depth, depth_fault) = match depth {
+        None => (None, None),
+        Some(Ok(depth)) => (Some(Box::new(depth)), None),
+        Some(Err(fault)) => (None, Some(fault)),
+    };
     let view = |face: &str, undistortion: Option<Undistortion>| {
         let whole = Pinhole {
             width: lens.width,
@@ -199,6 +209,7 @@ fn photograph(
                 header,
                 rendered: None,
                 window: None,
+                depth: depth.clone(),
             },
         }
     };
@@ -216,7 +227,7 @@ fn photograph(
             views.iter().map(|view| is_hidden(view, views.len() > 1, &weights, &lens)).collect()
         }
     };
-    Ok(Photograph { views, hidden, held_out: frame.held_out, id: frame.id })
+    Ok(Photograph { views, hidden, held_out: frame.held_out, id: frame.id, depth_fault })
 }
 
 /// Checks that a mask has the proportions of its photograph.

@@ -19,7 +19,7 @@ use densify_fixtures::{Made, SIZE};
 
 impl Note {
     /// Returns true if the note names no option and contains these words.
-    fn contains(&self, words: &str) -> bool {
+    pub(crate) fn contains(&self, words: &str) -> bool {
         matches!(self, Self::Text(text) if text.contains(words))
     }
 }

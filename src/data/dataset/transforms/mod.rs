@@ -142,6 +142,10 @@ fn read(
             Some(value) => Some(fields.mask((root, folders, &photographs), &found, value)?),
             None => folders.mask(&found, named, &photographs)?,
         };
+        let depth = match fields.text("depth_file_path")? {
+            Some(value) => fields.depth((root, folders), &found, value)?,
+            None => folders.depth(&found, named)?,
+        };
         let (lens, header) = fields.lens(&found.path, found.reduced)?;
         let frame = Frame {
             name: found.name,
@@ -151,6 +155,7 @@ fn read(
             image: found.path,
             reduced: found.reduced,
             mask,
+            depth,
             lens,
             header,
             rotation,

@@ -4,6 +4,7 @@ use std::io::Read;
 use std::path::{Path, PathBuf};
 
 use super::super::LoadError;
+use super::super::depth::DepthFile;
 use super::super::folders::{Folders, ImageFile};
 use super::super::mask_files::{Listed, MaskFile};
 use super::super::paths::{DataPath, Root, namesake, relative};
@@ -76,6 +77,39 @@ pub(in super::super) fn usual_points(
 }
 
 impl Fields<'_> {
+    /// The depth file that a frame names, if depth is read. A missing file is not an error, as depth may be left out.
+    pub(super) fn depth(
+        &self,
+        (root, folders): (&Root, &Folders),
+        image: &ImageFile,
+        value: &str,
+    ) -> Result<Option<DepthFile>, LoadError> {
+        if !folders.reads_depth {
+            return Ok(None);
+        }
+        let field = self.full("depth_file_path");
+        let named = DataPath { file: self.path, field: &field, value };
+        let found = if folders.folder_for_absolute(value).is_some() {
+            let mut found = None;
+            for value in named.suffixes()?.filter(|end| end.contains('/')) {
+                found = found.or(root.existing(DataPath { value: &value, ..named })?);
+            }
+            found
+        } else {
+            root.existing_on_any_system(named)?
+        };
+        let Some(path) = found else { return folders.depth(image, named) };
+        let Some(depth) = DepthFile::new(path) else {
+            let problem = format!("{value:?} is no PNG, NumPy or OpenEXR file");
+            return Err(self.fault("depth_file_path", problem));
+        };
+        let unit = self.number("depth_unit_scale_factor")?;
+        if unit.is_some_and(|unit| !(unit > 0.0 && unit.is_normal())) {
+            return Err(self.fault("depth_unit_scale_factor", "it is not a positive number"));
+        }
+        Ok(Some(DepthFile { unit, ..depth }.with_confidence(root, named)?))
+    }
+
     /// The mask that a frame names.
     pub(super) fn mask(
         &self,

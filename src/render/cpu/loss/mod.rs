@@ -26,7 +26,7 @@ use rayon::prelude::*;
 
 use super::blocks::parts;
 use super::rasterize::{TileCanvas, ZERO_PLANE, copy_row_of_plane, set_row_of_plane};
-use super::rasterize_bwd::TileGradient;
+use super::rasterize_bwd::{ERROR, TileGradient};
 use super::simd::{V, WIDTH, each};
 use super::threads::Threads;
 use super::tiles::{Grid, TILE};
@@ -69,7 +69,7 @@ pub(super) struct LossBuffers {
 pub(super) struct ErrorRequests {
     /// Weights of |e| and 1 − SSIM in the errors that select candidates, if these are requested.
     pub(super) for_candidates: Option<[f32; 2]>,
-    /// Weighting of the errors that rows accumulate, if these are requested; they are written to the last plane of the
+    /// Weighting of the errors that rows accumulate, if these are requested; they are written to their plane of the
     /// gradient.
     pub(super) for_rows: Option<ErrorScore>,
 }
@@ -220,7 +220,7 @@ impl LossBuffers {
         LossValue { l1: l1 / samples, ssim: ssim / samples }
     }
 
-    /// Writes the errors that rows accumulate, weighted by `score`, to the last plane of the gradient.
+    /// Writes the errors that rows accumulate, weighted by `score`, to their plane of the gradient.
     fn write_row_errors(
         &self,
         threads: &Threads,
@@ -233,14 +233,14 @@ impl LossBuffers {
         let line = || vec![0.0; segments.stride()];
         threads.each_with("loss by pixel", tasks, line, |pixels, (i, tiles)| {
             for tile in tiles.iter_mut() {
-                tile.planes[4] = ZERO_PLANE;
+                tile.planes[ERROR] = ZERO_PLANE;
             }
             for row in 0..TILE.min(grid.height - i * TILE) {
                 let y = i * TILE + row;
                 segments.restore(segments.line(&self.errors[1], y), pixels);
                 self.weights.apply(score, y, &mut pixels[..grid.width]);
                 for (tile, errors) in tiles.iter_mut().zip(pixels.as_chunks::<TILE>().0) {
-                    set_row_of_plane(&mut tile.planes[4], row, errors);
+                    set_row_of_plane(&mut tile.planes[ERROR], row, errors);
                 }
             }
         });

@@ -88,7 +88,7 @@ fn check_stage(stage: &Stage, text: &str, module: &Module, capabilities: Capabil
 #[test]
 fn every_override_has_a_value_and_every_signal_a_number() {
     let variant = Variant {
-        records: RecordLayout::ALL,
+        records: RecordLayout::DIFFERENTIATED,
         alpha_and_depth: true,
         shortcuts: Shortcuts::default(),
         antialiasing: Antialiasing::Wide,

@@ -139,6 +139,8 @@ fn train(trial: &mut Trial<'_>, name: &str) -> Result<(), Box<dyn std::error::Er
         frozen: 0,
         has_all_bands: false,
         on_nan: OnNan::Stop,
+        depth: None,
+        distortion: 0.0,
     };
     let policy = find(name)?.build(&toml::Table::new(), &scene)?;
     let needs = policy.needs(&scene);

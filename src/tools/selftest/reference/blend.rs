@@ -165,6 +165,31 @@ pub fn backward(
     rules: &Rules,
     upstream: &Upstream,
 ) -> Vec<ScreenGradient> {
+    backward_along_rays(splats, order, view, rules, upstream, &[])
+}
+
+/// The rows blended into each pixel with their weights, front to back.
+pub fn rays(
+    splats: &[Splat],
+    order: &[usize],
+    view: View<'_>,
+    rules: &Rules,
+) -> Vec<Vec<(usize, f64)>> {
+    let blended = |hit: Contribution| (hit.row, hit.alpha * hit.transmittance);
+    let ray = |at| trace(splats, order, at, rules).contributions.into_iter().map(blended).collect();
+    pixels(view).map(ray).collect()
+}
+
+/// Gradients of Σ image · upstream plus a function of the [`rays`], whose derivatives with respect to the weights and
+/// depths of each pixel's rows are given; if empty, they are 0.
+pub fn backward_along_rays(
+    splats: &[Splat],
+    order: &[usize],
+    view: View<'_>,
+    rules: &Rules,
+    upstream: &Upstream,
+    by_sample: &[Vec<[f64; 2]>],
+) -> Vec<ScreenGradient> {
     let mut gradient = vec![ScreenGradient::default(); splats.len()];
     for (p, at) in pixels(view).enumerate() {
         let pixel = trace(splats, order, at, rules);
@@ -173,13 +198,15 @@ pub fn backward(
         // Loss contribution of everything behind; at first the background.
         let mut behind: f64 =
             pixel.transmittance * (0..3).map(|c| view.background[c] * d_rgb[c]).sum::<f64>();
-        for hit in pixel.contributions.iter().rev() {
+        for (i, hit) in pixel.contributions.iter().enumerate().rev() {
+            let [by_weight, by_depth] = by_sample.get(p).map_or([0.0; 2], |ray| ray[i]);
             let splat = &splats[hit.row];
             let colour = visible_colour(splat);
             let weight = hit.alpha * hit.transmittance;
             let value = (0..3).map(|c| colour[c] * d_rgb[c]).sum::<f64>()
                 + splat.depth * d_depth
-                + d_alpha_out;
+                + d_alpha_out
+                + by_weight;
             let d_alpha = hit.transmittance * value - behind / (1.0 - hit.alpha);
             behind += weight * value;
 
@@ -187,7 +214,7 @@ pub fn backward(
             for (colour, d) in sum.colour.iter_mut().zip(d_rgb) {
                 *colour += weight * d;
             }
-            sum.depth += weight * d_depth;
+            sum.depth += weight * d_depth + by_depth;
             sum.max_weight = sum.max_weight.max(weight);
             sum.sum_weight += weight;
             sum.pixels += 1;

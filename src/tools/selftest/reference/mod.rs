@@ -7,6 +7,7 @@
 //! `tests/it/central.rs` checks the gradients by central differences, `tests/it/oracle/` compares with stored arrays.
 
 pub mod blend;
+pub mod depth;
 pub mod loss;
 pub mod project;
 

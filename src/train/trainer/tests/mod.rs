@@ -329,6 +329,8 @@ const OPTIONS: TrainOptions = TrainOptions {
     frozen: 0,
     has_all_bands: false,
     on_nan: OnNan::Prune,
+    depth: None,
+    distortion: 0.0,
 };
 
 fn build(

@@ -11,6 +11,7 @@ use densify_scenegen::{
 use serde::{Deserialize, Serialize};
 
 use super::PREFIX;
+use crate::dataset::depth::{DepthChoice, DepthSource};
 use crate::dataset::images::ImageSource;
 use crate::dataset::photographs::{Photograph, target_size};
 use crate::dataset::prepare::{assemble, text_notes};
@@ -60,17 +61,24 @@ pub(in crate::dataset) fn load(
     let hit = entry.as_ref().and_then(Entry::read);
     // Another program may have written an entry in which images are missing.
     if let Some(hit) = hit.filter(|hit| hit.frames.len() == hit.summary.views.len()) {
-        return dataset(path, hit, options);
+        let truth = if options.depth.choice == DepthChoice::On && options.depth.points.is_none() {
+            Some(GroundTruth::of_scene(Scene::prepare(&source, &parameters)?))
+        } else {
+            None
+        };
+        return dataset(path, hit, truth.as_ref(), options);
     }
     let scene = Scene::prepare(&source, &parameters)?;
     let (frames, points) = render(&scene);
     let surface_bytes = BUILD_FACTOR * scene.surface.bytes() as u64;
-    let summary = Summary { views: scene.views, notes: scene.model.notes, surface_bytes };
-    let rendered = Rendered { summary, frames, points };
+    let (views, notes) = (scene.views.clone(), scene.model.notes.clone());
+    let truth = (options.depth.choice == DepthChoice::On && options.depth.points.is_none())
+        .then(|| GroundTruth::of_scene(scene));
+    let rendered = Rendered { summary: Summary { views, notes, surface_bytes }, frames, points };
     if let Some(entry) = entry {
         entry.write(&rendered);
     }
-    dataset(path, rendered, options)
+    dataset(path, rendered, truth.as_ref(), options)
 }
 
 /// Renders all views and collects points. Depths, normals and triangles are then dropped, as nothing else needs them.
@@ -119,13 +127,14 @@ impl From<densify_scenegen::Error> for LoadError {
     }
 }
 
-/// Turns a rendered scene into the dataset named `path`.
+/// Turns a rendered scene into the dataset named `path`; its training views have the depth of `truth`, if it is given.
 ///
 /// # Errors
 /// When the options leave no view to train on.
 fn dataset(
     path: &Path,
     Rendered { summary, frames, points }: Rendered,
+    truth: Option<&GroundTruth>,
     options: &LoadOptions,
 ) -> Result<Dataset, LoadError> {
     let mut photographs: Vec<Photograph> = (0..)
@@ -134,10 +143,16 @@ fn dataset(
         .map(|((number, view), frame)| {
             let camera = camera(&view.camera);
             let held_out = view.split == Split::Test;
-            let views = vec![dataset_view(&view.name, camera, frame, options)];
-            Photograph { views, hidden: Vec::new(), held_out, id: Some(number) }
+            let mut shown = dataset_view(&view.name, camera, frame, options);
+            if let Some(truth) = truth.filter(|_| !held_out) {
+                let seen = truth.g_buffer(&view.name, &view.camera)?;
+                let source = DepthSource::rendered((seen.width, seen.height), seen.depth);
+                shown.source.depth = source.map(Box::new);
+            }
+            let (views, hidden) = (vec![shown], Vec::new());
+            Ok(Photograph { views, hidden, held_out, id: Some(number), depth_fault: None })
         })
-        .collect();
+        .collect::<Result<_, LoadError>>()?;
     let name = |photograph: &Photograph| photograph.views[0].name.clone();
     photographs.sort_by_cached_key(name);
     let mut sampler = TrackSampler::new();
