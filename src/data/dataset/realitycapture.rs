@@ -122,7 +122,11 @@ fn read(root: &Root, options: &LoadOptions) -> Result<Option<Scene>, LoadError> 
             Some(found) => (&in_images, found),
             None => {
                 let Some(found) = in_root.image(named)? else {
-                    first_missing.get_or_insert_with(|| in_images.shown_path(named));
+                    first_missing.get_or_insert_with(|| {
+                        let in_root = Some(in_root.shown_path(named));
+                        let in_root = in_root.filter(|path| namesake(path).is_some());
+                        in_root.unwrap_or_else(|| in_images.shown_path(named))
+                    });
                     missing.push(name.to_owned());
                     continue;
                 };
