@@ -23,7 +23,7 @@ use super::images::{self, ImageHeader};
 use super::lens::models::Term;
 use super::lens::{Distortion, Lens, Projection};
 use super::mask_files::Listed;
-use super::paths::{DataPath, Root, namesake, relative};
+use super::paths::{DataPath, Root, existing_namesake, namesake, relative};
 use super::pose::{check_lens, checked_pose};
 use super::prepare::text_notes;
 use super::transforms::usual_points;
@@ -162,8 +162,7 @@ fn read(root: &Root, options: &LoadOptions) -> Result<Option<Scene>, LoadError> 
     if let Some(first) = missing.first() {
         let (missing, all) = (missing.len(), missing.len() + frames.len());
         let file = path.file_name().unwrap_or_default().display();
-        let other = first_missing.as_deref().and_then(namesake);
-        let other = other.map_or_else(String::new, |other| format!("; {other} exists"));
+        let other = first_missing.as_deref().map(existing_namesake).unwrap_or_default();
         notes.push(format!(
             "{file}: {missing} of {all} photographs do not exist and are skipped (first: {first}{other})"
         ));
