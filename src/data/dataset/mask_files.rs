@@ -125,11 +125,11 @@ impl Folders {
         &self,
         image: &ImageFile,
         named: DataPath<'_>,
-        listed: &Listed<'_>,
+        photographs: &Listed<'_>,
     ) -> Result<Option<MaskFile>, LoadError> {
         let at = |root: &Root, value: String| {
             let found = root.existing(DataPath { value: &value, ..named })?;
-            Ok::<_, LoadError>(found.filter(|path| !listed.contains(path)))
+            Ok::<_, LoadError>(found.filter(|path| !photographs.contains(path)))
         };
         // The file's name has an extension, which the listed name may lack.
         let listed = self.inside_images(&image.name);

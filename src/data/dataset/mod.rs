@@ -225,8 +225,7 @@ impl Dataset {
         if scene.frames.is_empty() {
             let listing = scene.listing.display();
             let first = scene.first_missing.map_or_else(String::new, |path| {
-                let other = paths::namesake(&path);
-                let other = other.map_or_else(String::new, |other| format!(" ({other} exists)"));
+                let other = paths::existing_namesake(&path);
                 format!("; the first one looked for is {}{other}", path.display())
             });
             let problem = format!("{listing} lists no image that exists{first}");

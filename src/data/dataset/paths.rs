@@ -132,6 +132,11 @@ pub(super) fn namesake(path: &Path) -> Option<String> {
     Some(other.file_name()?.to_string_lossy().into_owned())
 }
 
+/// Words for the [`namesake`] of a missing photograph, to follow its name; empty if there is none.
+pub(super) fn existing_namesake(path: &Path) -> String {
+    namesake(path).map_or_else(String::new, |other| format!("; {other} exists"))
+}
+
 fn names(folder: &Path) -> Names {
     let mut entries: Vec<PathBuf> =
         fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path()).collect();

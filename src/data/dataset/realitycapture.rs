@@ -23,7 +23,7 @@ use super::images::{self, ImageHeader};
 use super::lens::models::Term;
 use super::lens::{Distortion, Lens, Projection};
 use super::mask_files::Listed;
-use super::paths::{DataPath, Root, namesake, relative};
+use super::paths::{DataPath, Root, existing_namesake, namesake, relative};
 use super::pose::{check_lens, checked_pose};
 use super::prepare::text_notes;
 use super::transforms::usual_points;
@@ -122,7 +122,11 @@ fn read(root: &Root, options: &LoadOptions) -> Result<Option<Scene>, LoadError> 
             Some(found) => (&in_images, found),
             None => {
                 let Some(found) = in_root.image(named)? else {
-                    first_missing.get_or_insert_with(|| in_images.shown_path(named));
+                    first_missing.get_or_insert_with(|| {
+                        let in_root = Some(in_root.shown_path(named));
+                        let in_root = in_root.filter(|path| namesake(path).is_some());
+                        in_root.unwrap_or_else(|| in_images.shown_path(named))
+                    });
                     missing.push(name.to_owned());
                     continue;
                 };
@@ -160,8 +164,7 @@ fn read(root: &Root, options: &LoadOptions) -> Result<Option<Scene>, LoadError> 
     if let Some(first) = missing.first() {
         let (missing, all) = (missing.len(), missing.len() + frames.len());
         let file = path.file_name().unwrap_or_default().display();
-        let other = first_missing.as_deref().and_then(namesake);
-        let other = other.map_or_else(String::new, |other| format!("; {other} exists"));
+        let other = first_missing.as_deref().map(existing_namesake).unwrap_or_default();
         notes.push(format!(
             "{file}: {missing} of {all} photographs do not exist and are skipped (first: {first}{other})"
         ));

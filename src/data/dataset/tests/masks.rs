@@ -67,7 +67,7 @@ fn listed_photographs_are_no_masks() {
             );
         }
         // The next of the usual names counts.
-        image(&made.file("images/dynamic_mask_a.png"), SIZE, 200);
+        write_mask(&made.file("images/dynamic_mask_a.png"), |x| u8::from(x < 10));
         let mask = load(&made).train[0].source.mask.clone().expect("a mask");
         assert!(mask.file.path.ends_with("dynamic_mask_a.png"), "{}", mask.file.path.display());
     }

@@ -197,7 +197,7 @@ fn damaged_tables_are_refused_by_line_and_column() {
                         std::fs::rename(&image, image.with_extension("webp")).unwrap();
                     }
                 },
-                "cameras.csv, no image, a.png (a.webp exists)",
+                "cameras.csv, no image, a.png; a.webp exists",
             ),
             ("not an image", |m| m.write("images/b.png", "hello"), "images/b.png, decode"),
             (

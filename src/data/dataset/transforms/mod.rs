@@ -22,7 +22,7 @@ use super::formats::DatasetFormat;
 use super::frame_lists::FrameLists;
 use super::json;
 use super::mask_files::Listed;
-use super::paths::{DataPath, Root, namesake, relative};
+use super::paths::{DataPath, Root, existing_namesake, relative};
 use super::prepare::text_notes;
 use super::{Frame, LoadError, LoadOptions, Note, Scene, Split, colmap};
 use fields::Fields;
@@ -177,17 +177,11 @@ fn read(
     }
     let mut notes = lists.notes(name);
     notes.extend(top.notes(&listed)?);
-    if let Some(first) = missing.first() {
-        let count = missing.len();
-        let other = first_missing
-            .as_deref()
-            .and_then(namesake)
-            .map_or_else(String::new, |other| format!("; {other} exists"));
-        notes.push(format!(
-            "{name}: {count} of {} frames have no image file and are skipped ({first} is the first{other})",
-            listed.len()
-        ));
-    }
+    let missing = missing.first().zip(first_missing.as_deref()).map(|(first, path)| {
+        let (count, all, other) = (missing.len(), listed.len(), existing_namesake(path));
+        format!("{name}: {count} of {all} frames have no image file and are skipped ({first} is the first{other})")
+    });
+    notes.extend(missing);
     if let Some(first) = bad.first() {
         let (count, all) = (bad.len(), listed.len());
         notes.push(format!(

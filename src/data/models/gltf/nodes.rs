@@ -68,7 +68,10 @@ impl Placed<'_> {
     /// When the transform cannot be applied to splats, or the node changes them in another way than by a transform.
     pub(super) fn transform(&self, path: &Path) -> Result<Similarity, LoadError> {
         let Self { index, node, matrix, .. } = self;
-        let wrong = |problem: &str| LoadError::damaged(path, format!("nodes[{index}]"), problem);
+        let wrong = |problem: &str| {
+            let remedy = "place the splats without it, and export the file again";
+            LoadError::malformed(path, format!("nodes[{index}]"), problem, remedy)
+        };
         if node.extensions.contains_key(INSTANCING) {
             return Err(wrong(&format!("{INSTANCING} is not applied to splats")));
         }

@@ -215,18 +215,6 @@ fn dishonest_files_are_refused_with_the_reason() {
         ),
         ("zeros", vec![0; 320], &["convert"]),
         ("other JSON", b"{\"frames\":[]}".to_vec(), &["not a model", "convert"]),
-        ("levels", b"{\"lodLevels\":1}".to_vec(), &["levels of detail", "meta.json files"]),
-        // A tileset has an asset, as glTF does.
-        (
-            "a tileset",
-            br#"{"asset":{},"geometricError":1,"root":{"children":[{"content":{"uri":"a/b.glb"}}]}}"#.to_vec(),
-            &["a tileset (3D Tiles)", "name a file that it lists, such as a/b.glb"],
-        ),
-        (
-            "an empty tileset",
-            br#"{"asset":{},"geometricError":1,"root":{}}"#.to_vec(),
-            &["a tileset (3D Tiles)", "name one of the files"],
-        ),
         ("a ZIP", archive(&[("a.ply", b"ply")]), &["ZIP archive, but no SOG", "unpack it"]),
         (
             "a model among others",
@@ -289,16 +277,32 @@ fn dishonest_files_are_refused_with_the_reason() {
             assert!(message.contains(word), "{case}: {word:?} is not in: {message}");
         }
     }
-    let folder = tempfile::tempdir().unwrap();
-    let message = read_model(folder.path()).unwrap_err().to_string();
+    let message = read_model(tempfile::tempdir().unwrap().path()).unwrap_err().to_string();
     assert!(message.contains("without meta.json"), "{message}");
-    // The folder of a streamed model.
-    std::fs::write(folder.path().join("lod-meta.json"), "{\"lodLevels\":1}").unwrap();
-    let message = read_model(folder.path()).unwrap_err().to_string();
-    assert!(
-        is_model_folder(folder.path()) && message.contains("lod-meta.json is a list"),
-        "{message}"
-    );
+}
+
+#[test]
+fn lists_of_models_are_refused_with_the_file_to_name() {
+    // A tileset has an asset, as glTF does.
+    let tileset = |root: &str| format!(r#"{{"asset":{{}},"geometricError":1,"root":{{{root}}}}}"#);
+    let nested = tileset(r#""children":[{"content":{"uri":"a/b.glb"}}]"#);
+    for (name, contents, words) in [
+        ("lod-meta.json", "{\"lodLevels\":1}", ["levels of detail", "one of the meta.json files"]),
+        (
+            "tileset.json",
+            &nested,
+            ["a tileset (3D Tiles)", "a file that it lists, such as a/b.glb"],
+        ),
+        ("tileset.json", &tileset(""), ["a tileset (3D Tiles)", "name one of the files"]),
+    ] {
+        let (folder, path) = saved(name, contents);
+        let message = read_model(&path).unwrap_err().to_string();
+        assert!(message.contains(name) && words.iter().all(|w| message.contains(w)), "{message}");
+        // The folder of a streamed model.
+        let of_folder = read_model(folder.path()).unwrap_err().to_string();
+        assert_eq!(is_model_folder(folder.path()), name == "lod-meta.json");
+        assert_eq!(of_folder == message, name == "lod-meta.json", "{of_folder}");
+    }
 }
 
 #[test]
