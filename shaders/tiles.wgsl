@@ -12,8 +12,9 @@
 @group(0) @binding(1) var<storage, read_write> state: State;
 // Workgroup counts of indirect dispatches, three numbers each; see ARGS_*.
 @group(0) @binding(2) var<storage, read_write> groups: array<u32>;
-@group(0) @binding(3) var<storage, read> depths: array<u32>;
-@group(0) @binding(4) var<storage, read> footprints: array<vec4<u32>>;
+// See splat.wgsl and footprint.wgsl.
+@group(0) @binding(3) var<storage, read> splats: array<f32>;
+@group(0) @binding(4) var<storage, read> footprints: array<vec2<u32>>;
 // Only read. Writable, because they may be ranges of the buffer that keys_out and values_out are in.
 @group(0) @binding(5) var<storage, read_write> keys_in: array<u32>;
 @group(0) @binding(6) var<storage, read_write> values_in: array<u32>;
@@ -40,6 +41,9 @@ const ARGS_ROW_BLOCKS: u32 = 3u;
 const ARGS_ROW_DIGITS: u32 = 6u;
 const ARGS_ENTRY_BLOCKS: u32 = 9u;
 const ARGS_ENTRY_DIGITS: u32 = 12u;
+// The kernels that change rows: by row, then those of the bands of colour.
+const ARGS_STEP: u32 = 15u;
+const ARGS_BANDS: u32 = 18u;
 
 // The numbers to sum (launch.a of scan_blocks and scan_sums). COUNTS_AGAIN: the entries of a band that the
 // total already includes.
@@ -58,6 +62,17 @@ fn set_groups(at: u32, count: u32) {
     groups[at] = min(count, ACROSS);
     groups[at + 1u] = ceil_div(count, ACROSS);
     groups[at + 2u] = 1u;
+}
+
+// Decides if the step changes the model: not if it needs more bands than were encoded.
+fn conclude_bands(fits: bool) {
+    state.short = select(1u, 0u, fits);
+    let rows = select(0u, frame.model.x, fits);
+    set_groups(ARGS_STEP, ceil_div(rows, GROUP));
+    for (var band = 0u; band < 4u; band++) {
+        let pairs = (3u * (2u * band + 1u) + 1u) / 2u;
+        set_groups(ARGS_BANDS + 3u * band, ceil_div(rows * pairs, GROUP));
+    }
 }
 
 // --- Prefix sums --------------------------------------------------------------------------------
@@ -113,7 +128,7 @@ fn scan_blocks(
         var value = 0u;
         if i < count {
             if launch.a == FLAGS {
-                value = select(0u, 1u, depths[i] != NONE);
+                value = select(0u, 1u, splats[SPLAT * i + DEPTH] > 0.0);
             } else {
                 value = sums[i];
             }
@@ -177,7 +192,6 @@ fn conclude(total: u32) {
             set_groups(ARGS_ROW_DIGITS, ceil_div(16u * blocks, BLOCK));
             state.entries_low = 0u;
             state.entries_high = 0u;
-            state.short = 0u;
             state.bands = 1u;
         }
         case COUNTS_ALL: {
@@ -186,7 +200,7 @@ fn conclude(total: u32) {
                 // Passes were encoded for one band only. If the image needs more, the lists stay empty and
                 // no kernel changes the model.
                 let fits = total <= frame.model.z;
-                state.short = select(1u, 0u, fits);
+                conclude_bands(fits);
                 state.cuts[0] = 0u;
                 state.cuts[1] = frame.image.w;
                 set_held(select(0u, total, fits), true);
@@ -221,11 +235,42 @@ fn summed(i: u32) -> u32 {
 @compute @workgroup_size(256)
 fn compact(@builtin(global_invocation_id) id: vec3<u32>) {
     let row = index_of(id);
-    if row < frame.model.x && depths[row] != NONE {
+    if row >= frame.model.x {
+        return;
+    }
+    let depth = splats[SPLAT * row + DEPTH];
+    if depth > 0.0 {
         let to = summed(row);
-        keys_out[to] = depths[row];
+        // The bits of positive numbers sort like the numbers.
+        keys_out[to] = bitcast<u32>(depth);
         values_out[to] = row;
     }
+}
+
+// A footprint, unpacked.
+struct Footprint {
+    // First and last tile.
+    low: vec2<u32>,
+    high: vec2<u32>,
+    // log2 of a block's width and height.
+    log2_block: vec2<u32>,
+    // Two spans each.
+    spans: vec2<u32>,
+}
+
+fn footprint_of(row: u32) -> Footprint {
+    let words = footprints[row];
+    let low = vec2(words.x, words.x >> 10u) & vec2(1023u);
+    let high = vec2(words.y, words.y >> 10u) & vec2(1023u);
+    let size = vec2(log2_block(high.x - low.x, LOG2_ACROSS), log2_block(high.y - low.y, LOG2_DOWN));
+    return Footprint(low, high, size, words >> vec2(20u));
+}
+
+// The first and the last block of a line of tiles; none if the first is beyond the last.
+fn span_of(f: Footprint, y: u32) -> vec2<u32> {
+    let line = (y - f.low.y) >> f.log2_block.y;
+    let span = select(f.spans.x, f.spans.y, line >= 2u) >> (6u * (line & 1u));
+    return vec2(span, span >> 3u) & vec2(7u);
 }
 
 // A run of tiles in one line of a footprint: columns first..=last.
@@ -234,11 +279,15 @@ struct Run {
     last: u32,
 }
 
-// The tiles of block `bit` in a line of tiles that are in the footprint and among the band's tiles
-// low..high; none if first > last. `before` is the line's first tile.
-fn run_of(x0: u32, x1: u32, log2_width: u32, bit: u32, before: u32, low: u32, high: u32) -> Run {
-    var first = x0 + (bit << log2_width);
-    var last = min(first + (1u << log2_width) - 1u, x1);
+// The tiles of a line that are in the footprint and among the band's tiles low..high; none if first > last. `before` is
+// the line's first tile.
+fn run_of(f: Footprint, y: u32, before: u32, low: u32, high: u32) -> Run {
+    let span = span_of(f, y);
+    if span.x > span.y {
+        return Run(1u, 0u);
+    }
+    var first = f.low.x + (span.x << f.log2_block.x);
+    var last = min(f.low.x + ((span.y + 1u) << f.log2_block.x) - 1u, f.high.x);
     if before + last < low || before + first >= high {
         return Run(1u, 0u);
     }
@@ -266,19 +315,13 @@ fn count_entries(@builtin(global_invocation_id) id: vec3<u32>) {
     if i >= state.visible {
         return;
     }
-    let f = footprints[order[i]];
+    let f = footprint_of(order[i]);
     let tiles = band();
-    let y0 = f.y & 0xffffu;
     var count = 0u;
-    for (var y = y0; y <= f.y >> 16u; y++) {
-        var bits = (f.z >> (8u * ((y - y0) >> (f.w >> 16u)))) & 0xffu;
-        while bits != 0u {
-            let bit = countTrailingZeros(bits);
-            bits &= bits - 1u;
-            let run = run_of(f.x & 0xffffu, f.x >> 16u, f.w & 0xffffu, bit, y * frame.image.z, tiles.x, tiles.y);
-            if run.first <= run.last {
-                count += run.last - run.first + 1u;
-            }
+    for (var y = f.low.y; y <= f.high.y; y++) {
+        let run = run_of(f, y, y * frame.image.z, tiles.x, tiles.y);
+        if run.first <= run.last {
+            count += run.last - run.first + 1u;
         }
     }
     sums[i] = min(count, MOST);
@@ -296,23 +339,17 @@ fn emit_entries(@builtin(global_invocation_id) id: vec3<u32>) {
         return;
     }
     let row = order[i];
-    let f = footprints[row];
+    let f = footprint_of(row);
     let tiles = band();
-    let y0 = f.y & 0xffffu;
     let first_slot = summed(i);
     var slot = first_slot;
-    for (var y = y0; y <= f.y >> 16u; y++) {
-        var bits = (f.z >> (8u * ((y - y0) >> (f.w >> 16u)))) & 0xffu;
-        while bits != 0u {
-            let bit = countTrailingZeros(bits);
-            bits &= bits - 1u;
-            let before = y * frame.image.z;
-            let run = run_of(f.x & 0xffffu, f.x >> 16u, f.w & 0xffffu, bit, before, tiles.x, tiles.y);
-            for (var x = run.first; x <= run.last; x++) {
-                keys_out[slot] = before + x;
-                values_out[slot] = row;
-                slot++;
-            }
+    for (var y = f.low.y; y <= f.high.y; y++) {
+        let before = y * frame.image.z;
+        let run = run_of(f, y, before, tiles.x, tiles.y);
+        for (var x = run.first; x <= run.last; x++) {
+            keys_out[slot] = before + x;
+            values_out[slot] = row;
+            slot++;
         }
     }
     store_slots(row, first_slot, slot - first_slot);
@@ -327,18 +364,12 @@ fn count_tiles(@builtin(global_invocation_id) id: vec3<u32>) {
     if i >= state.visible {
         return;
     }
-    let f = footprints[order[i]];
-    let y0 = f.y & 0xffffu;
-    for (var y = y0; y <= f.y >> 16u; y++) {
-        var bits = (f.z >> (8u * ((y - y0) >> (f.w >> 16u)))) & 0xffu;
-        while bits != 0u {
-            let bit = countTrailingZeros(bits);
-            bits &= bits - 1u;
-            let before = y * frame.image.z;
-            let run = run_of(f.x & 0xffffu, f.x >> 16u, f.w & 0xffffu, bit, before, 0u, frame.image.w);
-            for (var x = run.first; x <= run.last; x++) {
-                atomicAdd(&tile_counts[before + x], 1u);
-            }
+    let f = footprint_of(order[i]);
+    for (var y = f.low.y; y <= f.high.y; y++) {
+        let before = y * frame.image.z;
+        let run = run_of(f, y, before, 0u, frame.image.w);
+        for (var x = run.first; x <= run.last; x++) {
+            atomicAdd(&tile_counts[before + x], 1u);
         }
     }
 }
@@ -364,7 +395,7 @@ fn cut_bands() {
     }
     state.bands = band + 1u;
     let fits = band < launch.b;
-    state.short = select(1u, 0u, fits);
+    conclude_bands(fits);
     for (var k = 0u; k <= launch.b; k++) {
         if !fits {
             state.cuts[k] = 0u;

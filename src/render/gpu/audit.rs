@@ -12,7 +12,8 @@ impl GpuBackend {
         let rows = self.rows as u32;
         let bytes = 4 * u64::from(rows);
         let mut encoder = self.device.device.create_command_encoder(&Default::default());
-        encoder.clear_buffer(self.buffers.get("sums"), 0, Some(bytes.next_multiple_of(16)));
+        let (buffer, first) = self.buffers.place("sums");
+        encoder.clear_buffer(buffer, first, Some(bytes.next_multiple_of(16)));
         let pass = encoder.begin_compute_pass(&Default::default());
         let mut to = Recorder::new(pass);
         for Audit { launch, first_row, numbers, mark } in &self.launches.audits {

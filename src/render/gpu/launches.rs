@@ -198,7 +198,8 @@ pub(super) fn rebound(sizes: &Sizes) -> HashMap<&'static str, Vec<Vec<Rebinding>
         others.chain(moments(part)).collect()
     };
     // Without and with an exposure.
-    let images = vec![vec![], vec![("canvas", "exposed")]];
+    let derivatives = ("derivatives", sizes.derivatives());
+    let images = vec![vec![derivatives], vec![derivatives, ("canvas", "exposed")]];
     let keys_in = two(&|i| vec![("keys in", KEYS[i])]);
     HashMap::from([
         ("compact", vec![vec![("keys out", KEYS[0]), ("values out", VALUES[0])]]),

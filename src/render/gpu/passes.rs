@@ -19,6 +19,8 @@ mod args {
     pub(super) const ROW_DIGITS: u64 = 24;
     pub(super) const ENTRY_BLOCKS: u64 = 36;
     pub(super) const ENTRY_DIGITS: u64 = 48;
+    pub(super) const STEP: u64 = 60;
+    pub(super) const BANDS: u64 = 72;
 }
 /// Quantities of which prefix sums are computed; see `shaders/tiles.wgsl`.
 const FLAGS: u32 = 0;
@@ -51,6 +53,14 @@ impl Shape {
     }
 }
 
+/// The place of the errors of pixels: a buffer of their own, or the canvas, whose first three numbers are the gradient.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum ErrorPlace {
+    Buffer,
+    Gradient,
+    Canvas,
+}
+
 /// A search for the pixels of a view with the largest errors.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Search {
@@ -62,8 +72,7 @@ pub(super) struct Search {
     pub(super) room: u32,
     /// Smallest alpha of a pixel that may be selected.
     pub(super) min_alpha: f32,
-    /// True if the error is the length of the loss's gradient.
-    pub(super) of_gradient: bool,
+    pub(super) error: ErrorPlace,
 }
 
 /// Encodes dispatches into one pass.
@@ -252,7 +261,8 @@ impl Passes<'_> {
     /// Stage 6.
     pub(super) fn differentiate(&self, to: &mut Recorder<'_>) {
         to.stage("project_bwd");
-        to.run(self.launches.get("project_bwd"), [0; 4], self.shape.rows.div_ceil(256));
+        let launch = self.launches.get("project_bwd");
+        to.run_counted(launch, [0; 4], self.groups, args::STEP);
     }
 
     /// Stages 6 to 8. Colours step before the geometry, as their gradient depends on it. The weight in `mask` is
@@ -264,33 +274,32 @@ impl Passes<'_> {
         signals: bool,
         mask: Option<MaskTerm>,
     ) {
-        let l = self.launches;
-        let groups = self.shape.rows.div_ceil(256);
+        let (l, groups) = (self.launches, self.groups);
         self.differentiate(to);
         if signals {
-            to.run(l.get("accumulate"), [0; 4], groups);
+            to.run_counted(l.get("accumulate"), [0; 4], groups, args::STEP);
         }
         if let Some(MaskTerm { start, rate, weight, threshold }) = mask {
             let immediates = [start, rate, weight, logit(threshold)].map(f32::to_bits);
-            to.run(l.get("step_masks"), immediates, groups);
+            to.run_counted(l.get("step_masks"), immediates, groups, args::STEP);
         }
         to.stage("adam");
         for band in 0..=usize::from(sh_degree) {
             let [first, coefficients] = [(band * band) as u32, (2 * band + 1) as u32];
-            let pairs = self.shape.rows * (3 * coefficients).div_ceil(2);
             let immediates = [first, coefficients, 0, 0];
-            to.run(l.nth("adam_band", band), immediates, pairs.div_ceil(256));
+            let at = args::BANDS + 12 * band as u64;
+            to.run_counted(l.nth("adam_band", band), immediates, groups, at);
         }
-        to.run(l.get("adam_geometry"), [0; 4], groups);
+        to.run_counted(l.get("adam_geometry"), [0; 4], groups, args::STEP);
     }
 
     /// Writes the pixels with the largest errors to the range "worst": their number, then the error bits and the index
     /// of each, as many as fit. Pixels whose error equals that of the last one wanted are included.
     pub(super) fn worst(&self, to: &mut Recorder<'_>, search: &Search) {
         let l = self.launches;
-        let &Search { pixels, wanted, room, min_alpha, of_gradient } = search;
-        let (groups, map) = (pixels.div_ceil(256), usize::from(of_gradient));
-        let immediates = |a, b| [a, b, min_alpha.to_bits(), u32::from(of_gradient)];
+        let &Search { pixels, wanted, room, min_alpha, error } = search;
+        let (groups, map) = (pixels.div_ceil(256), usize::from(error != ErrorPlace::Buffer));
+        let immediates = |a, b| [a, b, min_alpha.to_bits(), error as u32];
         to.run(l.get("narrow"), [0, wanted, 0, 0], 1);
         for shift in [24, 16, 8, 0] {
             to.run(l.nth("count_errors", map), immediates(shift, u32::from(shift == 24)), groups);
