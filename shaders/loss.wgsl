@@ -308,7 +308,8 @@ fn reduced_sum(lane: u32) -> vec2<f32> {
     return reduced[0];
 }
 
-// Computes dL/dpixel. Of the image it reads only the pixels that it replaces.
+// Computes dL/dpixel. Of the image it reads only the pixels that it replaces. The last launch also computes the means
+// over the image.
 @compute @workgroup_size(64)
 fn pixel_gradient(
     @builtin(workgroup_id) id: vec3<u32>,
@@ -319,6 +320,9 @@ fn pixel_gradient(
         return;
     }
     let channel = launch.a;
+    if channel == 2u && tile == 0u {
+        total_of_tiles(lane);
+    }
     let corner = corner_of(tile);
     let size = frame.image.x * frame.image.y;
     let scale = 1.0 / (3.0 * f32(size));
@@ -357,9 +361,8 @@ fn pixel_gradient(
     }
 }
 
-// Computes the mean |e| and the mean SSIM of the image; a single group.
-@compute @workgroup_size(64)
-fn total(@builtin(local_invocation_index) lane: u32) {
+// Computes the mean |e| and the mean SSIM of the image; to be called by all invocations of a group.
+fn total_of_tiles(lane: u32) {
     var sums = vec2(0.0);
     for (var tile = lane; tile < frame.image.w; tile += MEMBERS) {
         sums += tile_sums[tile];
@@ -371,4 +374,10 @@ fn total(@builtin(local_invocation_index) lane: u32) {
         state.l1 = all.x / samples;
         state.ssim = all.y / samples;
     }
+}
+
+// The same where no gradient is computed; a single group.
+@compute @workgroup_size(64)
+fn total(@builtin(local_invocation_index) lane: u32) {
+    total_of_tiles(lane);
 }

@@ -2,7 +2,7 @@
 
 use super::GpuBackend;
 use super::launches::{Audit, MOMENT_MARKS};
-use super::passes::Recorder;
+use super::passes::{Record, Recorder};
 use crate::{BackendError, NonFinite, NumberKind};
 use densify_core::gaussians::ModelArray;
 
@@ -15,7 +15,7 @@ impl GpuBackend {
         let (buffer, first) = self.buffers.place("sums");
         encoder.clear_buffer(buffer, first, Some(bytes.next_multiple_of(16)));
         let pass = encoder.begin_compute_pass(&Default::default());
-        let mut to = Recorder::new(pass);
+        let mut to = Recorder::new(pass, self.buffers.get("groups"));
         for Audit { launch, first_row, numbers, mark } in &self.launches.audits {
             let groups = rows.saturating_sub(*first_row).div_ceil(256);
             to.run(launch, [rows, *numbers, *mark, *first_row], groups);

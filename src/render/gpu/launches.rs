@@ -202,7 +202,6 @@ pub(super) fn rebound(sizes: &Sizes) -> HashMap<&'static str, Vec<Vec<Rebinding>
     let images = vec![vec![derivatives], vec![derivatives, ("canvas", "exposed")]];
     let keys_in = two(&|i| vec![("keys in", KEYS[i])]);
     HashMap::from([
-        ("compact", vec![vec![("keys out", KEYS[0]), ("values out", VALUES[0])]]),
         ("count_digits", keys_in.clone()),
         ("find_tiles", keys_in),
         // The first four by the numbers of their keys and values; the fifth writes the order of rows.

@@ -23,8 +23,11 @@ pub(super) const ALLOCATOR_BLOCK: u64 = 4 << 20;
 pub(super) const UPLOAD_BYTES: u64 = 1 << 20;
 /// Largest number of bytes read back at a time.
 pub(super) const READ_BYTES: u64 = 1 << 20;
-/// Items per workgroup of the prefix sums and sorts; see `shaders/tiles.wgsl`.
+/// Items per workgroup of the prefix sums, and of the sorts; see `shaders/tiles.wgsl`.
 pub(super) const BLOCK: u64 = 2048;
+pub(super) const SORTED: u64 = 1024;
+/// Number of values of a digit of the sorts.
+const DIGITS: u64 = 256;
 /// Largest number of (row, tile) pairs in the tile lists at a time; prefix sums saturate beyond it.
 pub(super) const MAX_ENTRIES: u64 = 1 << 28;
 
@@ -211,7 +214,8 @@ impl Sizes {
             .map(|(i, name)| range("entries", name, i * numbers, 4 * self.cap))
             .collect();
         let (width, height) = self.image;
-        let sums = (self.budget.total as u64).max(16 * self.cap.div_ceil(BLOCK));
+        // The entries of each row, or each digit's items in each block.
+        let sums = (self.budget.total as u64).max(DIGITS * self.cap.div_ceil(SORTED));
         all.push(range("sums", "sums", 3 * numbers, 4 * sums));
         let derivatives = 12 * u64::from(width) * u64::from(height);
         if derivatives > self.row_sums_bytes() {
@@ -244,8 +248,8 @@ impl Sizes {
             let bytes = 4 * self.records.stride() as u64 * cap;
             add(Section::Tiles, "gradients per entry", "records", bytes);
         }
-        let sums = (self.budget.total as u64).max(16 * cap.div_ceil(BLOCK));
-        add(Section::Tiles, "sums", "block sums", 4 * sums.div_ceil(BLOCK));
+        let blocks = (self.budget.total as u64).div_ceil(BLOCK).max(DIGITS);
+        add(Section::Tiles, "sums", "block sums", 4 * blocks);
         let (width, height) = self.image;
         let pixels = u64::from(width) * u64::from(height);
         let tiles = u64::from(grid(width, height)[1]);
@@ -375,7 +379,7 @@ mod tests {
         let cas = Accumulation::SubgroupCas;
         let found = [(4, Storage::default()), (4, both8), (1, smallest)]
             .map(|(pairs, storage)| bytes_per_row(pairs, storage, cas));
-        assert_eq!(found, [1018, 666, 518]);
+        assert_eq!(found, [985, 633, 477]);
         // Records, the rows of slots, and the slots of rows.
         let in_slots = bytes_per_row(4, Storage::default(), Accumulation::Slots);
         assert_eq!(in_slots - found[0], 4 * (40 + 4) + 8);
