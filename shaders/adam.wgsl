@@ -5,7 +5,6 @@
 // terms and the noise on means that policies add (regularise.rs). Where the optimiser does not step
 // at every iteration, gradients are summed until it does (summed.rs).
 
-@group(0) @binding(1) var<storage, read> state: State;
 // A band of colour of all rows, and their other parameters. Moments and waiting gradients are those of the rows that
 // are not frozen, with indices called `own`.
 @group(0) @binding(2) var<storage, read_write> params: array<Coefficient>;
@@ -16,7 +15,7 @@
 @group(0) @binding(6) var<storage, read_write> ages: array<u32>;
 // The derivatives that project_bwd.wgsl has left; see record.wgsl.
 @group(0) @binding(7) var<storage, read> row_sums: array<f32>;
-@group(0) @binding(10) var<storage, read> splats: array<vec4<f32>>;
+@group(0) @binding(10) var<storage, read> splats: array<f32>;
 // 1/(1 − β₁^age) and √(1/(1 − β₂^age)).
 @group(0) @binding(8) var<storage, read> bias: array<vec2<f32>>;
 
@@ -103,7 +102,7 @@ fn adam_band(@builtin(global_invocation_id) id: vec3<u32>) {
     let width = 3u * launch.b;
     let pairs = (width + 1u) / 2u;
     let row = i / pairs;
-    if row < frame.frozen.x || row >= frame.model.x || state.short != 0u {
+    if row < frame.frozen.x || row >= frame.model.x {
         return;
     }
     let own = row - frame.frozen.x;
@@ -116,8 +115,7 @@ fn adam_band(@builtin(global_invocation_id) id: vec3<u32>) {
     let age = next_age(select(ages[own] & 0xffffu, ages[own] >> 16u, has_rest_age));
     let correction = bias[min(age, MATURE)];
     let at = RECORD * row;
-    let to = at + DIRECTION_AT;
-    let d = vec3(row_sums[to], row_sums[to + 1u], row_sums[to + 2u]);
+    let d = direction(load_row(row).mean).xyz;
     let unclamped = u32(row_sums[at + UNCLAMPED_AT]);
     var g = vec2(0.0);
     for (var p = 0u; p < 2u; p++) {
@@ -143,7 +141,7 @@ fn adam_band(@builtin(global_invocation_id) id: vec3<u32>) {
 @compute @workgroup_size(256)
 fn adam_geometry(@builtin(global_invocation_id) id: vec3<u32>) {
     let row = index_of(id);
-    if row < frame.frozen.x || row >= frame.model.x || state.short != 0u {
+    if row < frame.frozen.x || row >= frame.model.x {
         return;
     }
     let steps = is_set(MAIN_STEPS);
@@ -177,7 +175,13 @@ fn adam_geometry(@builtin(global_invocation_id) id: vec3<u32>) {
         for (var p = 0u; p < 2u; p++) {
             let k = 2u * j + p;
             if k < 11u {
-                let by_number = splats[3u * row + k / 4u][k % 4u] + add[k];
+                var by_number = 0.0;
+                if k < OF_SPLAT {
+                    by_number = splats[SPLAT * row + k];
+                } else {
+                    by_number = row_sums[RECORD * row + k - OF_SPLAT];
+                }
+                by_number += add[k];
                 g[p] = take_gradient(12u * own + k, by_number, steps, waited);
             }
         }

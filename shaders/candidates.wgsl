@@ -3,7 +3,7 @@
 
 @group(0) @binding(1) var<storage, read> state: State;
 @group(0) @binding(4) var<storage, read> tile_starts: array<u32>;
-@group(0) @binding(5) var<storage, read> splats: array<vec4<f32>>;
+@group(0) @binding(5) var<storage, read> splats: array<f32>;
 @group(0) @binding(6) var<storage, read> rows: array<RowPart>;
 // Indices of the pixels.
 @group(0) @binding(7) var<storage, read> pixels: array<u32>;
@@ -39,12 +39,11 @@ fn surface_row(tile: u32, at: vec2<f32>, is_median: bool) -> u32 {
     var most = 0.0;
     for (var k = tile_starts[tile]; k < tile_starts[tile + 1u]; k++) {
         let row = row_at(k);
-        let a = splats[3u * row];
-        let b = splats[3u * row + 1u];
-        let d = at - a.xy;
-        let u = a.z * (d.x - a.w * d.y);
-        let z = b.x * d.y;
-        let alpha = min(exp2(b.y - u * u - z * z), ALPHA_MAX);
+        let first = SPLAT * row;
+        let d = at - vec2(splats[first], splats[first + 1u]);
+        let u = splats[first + 2u] * (d.x - splats[first + 3u] * d.y);
+        let z = splats[first + 4u] * d.y;
+        let alpha = min(exp2(splats[first + 5u] - u * u - z * z), ALPHA_MAX);
         if !(alpha >= ALPHA_MIN) {
             continue;
         }
@@ -89,7 +88,7 @@ fn closest_approach(row: u32, at: vec2<f32>) -> vec4<f32> {
 
 // Bits of the final transmittance, and the index at which the pixel stopped.
 @group(0) @binding(9) var<storage, read> finish: array<vec2<u32>>;
-// The error per pixel, or the gradient in four numbers per pixel, the last unused.
+// The error per pixel; or the canvas, with the gradient and then an error in four numbers per pixel.
 @group(0) @binding(10) var<storage, read> map: array<f32>;
 // The known leading digits of the smallest error to be selected; the number of pixels still to be selected among
 // those whose errors begin with these digits; the number of pixels written. Then a histogram of the next digit.
@@ -104,7 +103,8 @@ const COUNTS: u32 = 4u;
 var<workgroup> counts: array<atomic<u32>, 256>;
 
 // Bits of a pixel's error, which sort like the errors; 0 for a pixel that cannot be a candidate.
-// launch.c: bits of the smallest alpha allowed, launch.d: 1 if the map is the gradient.
+// launch.c: bits of the smallest alpha allowed; launch.d: the error is in a map of its own (0), the
+// length of the gradient (1), or the last number of the canvas (2).
 fn key_of(pixel: u32) -> u32 {
     if pixel >= frame.image.x * frame.image.y || !(1.0 - bitcast<f32>(finish[pixel].x) >= bitcast<f32>(launch.c)) {
         return 0u;
@@ -113,6 +113,8 @@ fn key_of(pixel: u32) -> u32 {
     if launch.d == 1u {
         let g = vec3(map[4u * pixel], map[4u * pixel + 1u], map[4u * pixel + 2u]);
         error = sqrt(g.x * g.x + g.y * g.y + g.z * g.z);
+    } else if launch.d == 2u {
+        error = map[4u * pixel + 3u];
     } else {
         error = map[pixel];
     }

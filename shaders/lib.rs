@@ -13,6 +13,9 @@ macro_rules! shader {
 
 const VIEW: &str = shader!("shared/view");
 const GAUSSIAN: &str = shader!("shared/gaussian");
+const DIRECTION: &str = shader!("shared/direction");
+const SPLAT: &str = shader!("shared/splat");
+const FOOTPRINT: &str = shader!("shared/footprint");
 const RANDOM: &str = shader!("shared/random");
 const LIST_ROWS: &str = shader!("shared/list_rows");
 const LIST_SLOTS: &str = shader!("shared/list_slots");
@@ -136,38 +139,43 @@ const fn stage(name: &'static str, on: On, texts: &'static [&'static str]) -> St
 
 /// All stages. [`Stage::text`] adds the texts that depend on the device.
 pub const STAGES: &[Stage] = &[
-    stage("project", On::All, &[VIEW, GAUSSIAN, shader!("project")])
+    stage("project", On::All, &[VIEW, GAUSSIAN, DIRECTION, SPLAT, FOOTPRINT, shader!("project")])
         .with(&[Numbers::Rows, Numbers::Colours]),
-    stage("tiles", On::Emits, &[VIEW, shader!("tiles")]),
-    stage("rasterize", On::Tiles, &[VIEW, QUADS, shader!("rasterize")]),
+    stage("tiles", On::Emits, &[VIEW, SPLAT, FOOTPRINT, shader!("tiles")]),
+    stage("rasterize", On::Tiles, &[VIEW, SPLAT, QUADS, shader!("rasterize")]),
     stage("exposure", On::All, &[VIEW, shader!("exposure")]),
     stage("loss", On::All, &[VIEW, shader!("loss")]),
-    stage("rasterize_bwd", On::Slots, &[VIEW, RECORD, QUADS, BACKWARD, shader!("rasterize_bwd")]),
+    stage(
+        "rasterize_bwd",
+        On::Slots,
+        &[VIEW, RECORD, SPLAT, QUADS, BACKWARD, shader!("rasterize_bwd")],
+    ),
     stage(
         "rasterize_bwd_atomic",
         On::Atomics,
-        &[VIEW, RECORD, QUADS, BACKWARD, shader!("rasterize_bwd_atomic")],
+        &[VIEW, RECORD, SPLAT, QUADS, BACKWARD, shader!("rasterize_bwd_atomic")],
     ),
-    stage("project_bwd", On::All, &[VIEW, RECORD, GAUSSIAN, shader!("project_bwd")])
-        .with(&[Numbers::Rows, Numbers::Colours]),
-    stage("mask", On::All, &[VIEW, STEPS, shader!("mask")])
+    stage(
+        "project_bwd",
+        On::All,
+        &[VIEW, RECORD, SPLAT, GAUSSIAN, DIRECTION, shader!("project_bwd")],
+    )
+    .with(&[Numbers::Rows, Numbers::Colours]),
+    stage("mask", On::All, &[VIEW, RECORD, SPLAT, STEPS, shader!("mask")])
         .with(&[Numbers::Rows, Numbers::StoreRows]),
-    stage("adam", On::All, &[VIEW, RANDOM, RECORD, STEPS, shader!("adam")]).with(&[
-        Numbers::Rows,
-        Numbers::StoreRows,
-        Numbers::Steps,
-        Numbers::Moments,
-    ]),
-    stage("signals", On::All, &[VIEW, RECORD, shader!("signals")]).with(&[Numbers::Rows]),
+    stage("adam", On::All, &[VIEW, RANDOM, RECORD, SPLAT, DIRECTION, STEPS, shader!("adam")])
+        .with(&[Numbers::Rows, Numbers::StoreRows, Numbers::Steps, Numbers::Moments]),
+    stage("signals", On::All, &[VIEW, RECORD, SPLAT, shader!("signals")]).with(&[Numbers::Rows]),
     stage("apply", On::All, &[VIEW, RANDOM, STEPS, shader!("apply")]).with(&[
         Numbers::Rows,
         Numbers::StoreRows,
         Numbers::Band0,
         Numbers::Moments,
     ]),
-    stage("candidates", On::Lists, &[VIEW, RANDOM, shader!("candidates")]).with(&[Numbers::Rows]),
-    stage("observe", On::Slots, &[VIEW, QUADS, BLENDED, shader!("observe")]),
-    stage("observe_atomic", On::Atomics, &[VIEW, QUADS, BLENDED, shader!("observe_atomic")]),
+    stage("candidates", On::Lists, &[VIEW, RANDOM, SPLAT, shader!("candidates")])
+        .with(&[Numbers::Rows]),
+    stage("observe", On::Slots, &[VIEW, SPLAT, QUADS, BLENDED, shader!("observe")]),
+    stage("observe_atomic", On::Atomics, &[VIEW, SPLAT, QUADS, BLENDED, shader!("observe_atomic")]),
     stage("audit", On::All, &[VIEW, shader!("audit")]),
 ];
 

@@ -8,8 +8,8 @@
 // launch.a: the channel.
 
 @group(0) @binding(1) var<storage, read_write> state: State;
-// The image. dL/dpixel replaces it, channel by channel; each pixel's error for the row scores, if requested, replaces the
-// depth.
+// The image. dL/dpixel replaces it, channel by channel; each pixel's error replaces the depth, if errors are requested:
+// for the row scores, else for candidates.
 @group(0) @binding(2) var<storage, read_write> canvas: array<vec4<f32>>;
 // Red, green, blue, alpha, a byte each.
 @group(0) @binding(3) var<storage, read> truth: array<u32>;
@@ -21,7 +21,7 @@
 @group(0) @binding(6) var<storage, read> edges: array<f32>;
 // Sums of |e| and of SSIM per tile.
 @group(0) @binding(7) var<storage, read_write> tile_sums: array<vec2<f32>>;
-// Error per pixel, if candidates are requested.
+// Error per pixel for candidates, if there are row scores too.
 @group(0) @binding(8) var<storage, read_write> error: array<f32>;
 // See exposure.wgsl.
 @group(0) @binding(9) var<storage, read> exposure: array<vec4<f32>>;
@@ -198,17 +198,24 @@ fn ssim_of(
     );
 }
 
-// Adds a channel's |e| and 1 − SSIM to the pixel's errors: for candidates, and for row scores.
+// `before`, the sum over the channels so far, with the error of this channel; the mean after the last channel.
+fn with_error(before: f32, error: f32) -> f32 {
+    let sum = select(before, 0.0, launch.a == 0u) + error;
+    return select(sum, sum * (1.0 / 3.0), launch.a == 2u);
+}
+
+// Adds a channel's |e| and 1 − SSIM to the pixel's errors.
 fn add_errors(at: u32, abs_e: f32, dissimilarity: f32) {
-    let is_first = launch.a == 0u;
-    if (frame.draw.w & WITH_ERROR) != 0u {
-        let here = abs_e * frame.errors.x + dissimilarity * frame.errors.y;
-        let sum = select(error[at], 0.0, is_first) + here;
-        error[at] = select(sum, sum * (1.0 / 3.0), launch.a == 2u);
-    }
-    if (frame.draw.w & BY_PIXEL) != 0u {
-        let here = abs_e * frame.errors.z + dissimilarity * frame.errors.w;
-        canvas[at].w = select(canvas[at].w, 0.0, is_first) + here;
+    let for_candidates = abs_e * frame.errors.x + dissimilarity * frame.errors.y;
+    let wanted = frame.draw.w & (WITH_ERROR | BY_PIXEL);
+    if (wanted & BY_PIXEL) != 0u {
+        let for_scores = abs_e * frame.errors.z + dissimilarity * frame.errors.w;
+        canvas[at].w = with_error(canvas[at].w, for_scores);
+        if wanted != BY_PIXEL {
+            error[at] = with_error(error[at], for_candidates);
+        }
+    } else if wanted != 0u {
+        canvas[at].w = with_error(canvas[at].w, for_candidates);
     }
 }
 
@@ -301,7 +308,8 @@ fn reduced_sum(lane: u32) -> vec2<f32> {
     return reduced[0];
 }
 
-// Computes dL/dpixel. Of the image it reads only the pixels that it replaces.
+// Computes dL/dpixel. Of the image it reads only the pixels that it replaces. The last launch also computes the means
+// over the image.
 @compute @workgroup_size(64)
 fn pixel_gradient(
     @builtin(workgroup_id) id: vec3<u32>,
@@ -312,6 +320,9 @@ fn pixel_gradient(
         return;
     }
     let channel = launch.a;
+    if channel == 2u && tile == 0u {
+        total_of_tiles(lane);
+    }
     let corner = corner_of(tile);
     let size = frame.image.x * frame.image.y;
     let scale = 1.0 / (3.0 * f32(size));
@@ -345,14 +356,13 @@ fn pixel_gradient(
         let to = four.place + p;
         canvas[to][channel] = g * weight_of(to);
         if channel == 2u && (frame.draw.w & BY_PIXEL) != 0u {
-            canvas[to].w = score_contribution(canvas[to].w * (1.0 / 3.0), to);
+            canvas[to].w = score_contribution(canvas[to].w, to);
         }
     }
 }
 
-// Computes the mean |e| and the mean SSIM of the image; a single group.
-@compute @workgroup_size(64)
-fn total(@builtin(local_invocation_index) lane: u32) {
+// Computes the mean |e| and the mean SSIM of the image; to be called by all invocations of a group.
+fn total_of_tiles(lane: u32) {
     var sums = vec2(0.0);
     for (var tile = lane; tile < frame.image.w; tile += MEMBERS) {
         sums += tile_sums[tile];
@@ -364,4 +374,10 @@ fn total(@builtin(local_invocation_index) lane: u32) {
         state.l1 = all.x / samples;
         state.ssim = all.y / samples;
     }
+}
+
+// The same where no gradient is computed; a single group.
+@compute @workgroup_size(64)
+fn total(@builtin(local_invocation_index) lane: u32) {
+    total_of_tiles(lane);
 }

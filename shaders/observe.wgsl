@@ -66,7 +66,6 @@ fn replay(
     expect_end(completed && first >= end);
 }
 
-@group(0) @binding(8) var<storage, read> depths: array<u32>;
 @group(0) @binding(9) var<storage, read> slots_of_row: array<vec2<u32>>;
 @group(0) @binding(10) var<storage, read> all_records: array<f32>;
 @group(0) @binding(11) var<storage, read_write> row_sums: array<f32>;
@@ -84,7 +83,7 @@ fn gather_columns(@builtin(global_invocation_id) id: vec3<u32>) {
             totals[f] = row_sums[row * COLUMNS + f];
         }
     }
-    if depths[row] != NONE {
+    if splats[SPLAT * row + DEPTH] > 0.0 {
         let slots = slots_of_row[row];
         for (var i = 0u; i < slots.y; i++) {
             for (var f = 0u; f < COLUMNS; f++) {

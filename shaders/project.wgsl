@@ -1,12 +1,8 @@
 // Stage 1: projects rows to splats, one row per invocation, as in src/render/cpu/project.rs.
 
-// Three vectors per row: projected mean, l1, shear | l3, log2 of the opacity, depth, unused | colour, unused.
-@group(0) @binding(6) var<storage, read_write> splats: array<vec4<f32>>;
-// The tiles that the row's ellipse touches: columns x0 | x1 << 16, lines y0 | y1 << 16, a bit for each
-// of 8 × 4 blocks of tiles starting at (x0, y0), and the log2 of a block's width | that of its height << 16.
-@group(0) @binding(7) var<storage, read_write> footprints: array<vec4<u32>>;
-// Bits of the depth; NONE for rows that are not on screen.
-@group(0) @binding(8) var<storage, read_write> depths: array<u32>;
+// See splat.wgsl and footprint.wgsl.
+@group(0) @binding(6) var<storage, read_write> splats: array<f32>;
+@group(0) @binding(7) var<storage, read_write> footprints: array<vec2<u32>>;
 
 // Slack for the bounds of an ellipse [px]; see src/render/cpu/footprint.rs.
 const SLACK: f32 = 0.02;
@@ -26,7 +22,7 @@ fn project(@builtin(global_invocation_id) id: vec3<u32>) {
     if i >= frame.model.x {
         return;
     }
-    depths[i] = NONE;
+    splats[SPLAT * i + DEPTH] = 0.0;
     let row = load_row(i);
     var sound = below(row.logit, LARGEST);
     for (var k = 0u; k < 3u; k++) {
@@ -78,10 +74,13 @@ fn project(@builtin(global_invocation_id) id: vec3<u32>) {
     }
     let l1 = factor.x * EXPONENT_SCALE;
     let l3 = factor.z * EXPONENT_SCALE;
-    splats[3u * i] = vec4(u, v, l1, factor.y);
-    splats[3u * i + 1u] = vec4(l3, log2_opacity, g.p.z, 0.0);
-    splats[3u * i + 2u] = vec4(max(raw, vec3(0.0)), 0.0);
-    depths[i] = bitcast<u32>(g.p.z);
+    let colour = max(raw, vec3(0.0));
+    var splat = array<f32, SPLAT>(
+        u, v, l1, factor.y, l3, log2_opacity, colour.x, colour.y, colour.z, g.p.z,
+    );
+    for (var k = 0u; k < SPLAT; k++) {
+        splats[SPLAT * i + k] = splat[k];
+    }
 
     // Tiles: in each line of blocks, from the ellipse's leftmost to its rightmost point in that line.
     let hw = half_width * 1.0001 + SLACK;
@@ -93,18 +92,12 @@ fn project(@builtin(global_invocation_id) id: vec3<u32>) {
     let y0 = tile_of(v - hh - 0.5, lines);
     let y1 = tile_of(v + hh - 0.5, lines);
     let narrow = x0 == x1 || y0 == y1;
-    var log2_width = 0u;
-    while ((x1 - x0) >> log2_width) >= 8u {
-        log2_width++;
-    }
-    var log2_height = 0u;
-    while ((y1 - y0) >> log2_height) >= 4u {
-        log2_height++;
-    }
+    let log2_width = log2_block(x1 - x0, LOG2_ACROSS);
+    let log2_height = log2_block(y1 - y0, LOG2_DOWN);
     // With the scaled conic the ellipse is (l1·(dx − shear·dy))² + (l3·dy)² <= reach. Its rightmost point is
     // at dy = peak, its leftmost at dy = −peak.
     let peak = g.cov.y / g.cov.x * half_width;
-    var bits = 0u;
+    var spans = vec2(NO_SPANS);
     for (var line = 0u; line <= (y1 - y0) >> log2_height; line++) {
         var first = x0;
         var last = x1;
@@ -123,10 +116,9 @@ fn project(@builtin(global_invocation_id) id: vec3<u32>) {
             last = min(tile_of(u + right + 1e-4 * abs(right) + SLACK - 0.5, columns), x1);
         }
         if first <= last {
-            let from_bit = (first - x0) >> log2_width;
-            let to_bit = (last - x0) >> log2_width;
-            bits |= ((2u << to_bit) - (1u << from_bit)) << (8u * line);
+            let span = (first - x0) >> log2_width | ((last - x0) >> log2_width) << 3u;
+            set_span(&spans, line, span);
         }
     }
-    footprints[i] = vec4(x0 | x1 << 16u, y0 | y1 << 16u, bits, log2_width | log2_height << 16u);
+    footprints[i] = vec2(x0 | y0 << 10u | spans.x << 20u, x1 | y1 << 10u | spans.y << 20u);
 }

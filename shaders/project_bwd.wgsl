@@ -4,8 +4,7 @@
 
 // Sums of the records, one record per row.
 @group(0) @binding(6) var<storage, read_write> row_sums: array<f32>;
-@group(0) @binding(7) var<storage, read> depths: array<u32>;
-@group(0) @binding(8) var<storage, read_write> splats: array<vec4<f32>>;
+@group(0) @binding(7) var<storage, read_write> splats: array<f32>;
 
 @compute @workgroup_size(256)
 fn project_bwd(@builtin(global_invocation_id) id: vec3<u32>) {
@@ -14,9 +13,10 @@ fn project_bwd(@builtin(global_invocation_id) id: vec3<u32>) {
         return;
     }
     let at = i * RECORD;
-    if depths[i] == NONE {
-        for (var k = 0u; k < 3u; k++) {
-            splats[3u * i + k] = vec4(0.0);
+    let splat = i * SPLAT;
+    if !(splats[splat + DEPTH] > 0.0) {
+        for (var k = 0u; k < OF_SPLAT; k++) {
+            splats[splat + k] = 0.0;
         }
         for (var k = 0u; k < BASE; k++) {
             row_sums[at + k] = 0.0;
@@ -102,15 +102,19 @@ fn project_bwd(@builtin(global_invocation_id) id: vec3<u32>) {
     // dα/d(logit) = α(1 − o); 1 − o = σ(−logit) keeps its precision near o = 1.
     let by_logit = q / (1.0 + exp_exact(row.logit));
 
-    row_sums[at + DIRECTION_AT] = d.x;
-    row_sums[at + DIRECTION_AT + 1u] = d.y;
-    row_sums[at + DIRECTION_AT + 2u] = d.z;
-    row_sums[at + MEAN_Y_AT] = dm.y;
+    row_sums[at] = by_v.z;
+    row_sums[at + LOGIT_AT] = by_logit;
+    row_sums[at + MEAN_2D_AT] = dm.x;
+    row_sums[at + MEAN_2D_AT + 1u] = dm.y;
     row_sums[at + UNCLAMPED_AT] = dot(select(vec3(0.0), vec3(1.0, 2.0, 4.0), is_unclamped), vec3(1.0));
-    row_sums[at + L1_AT] = splats[3u * i].z;
-    splats[3u * i] = vec4(by_mean, by_log_scale.x);
-    splats[3u * i + 1u] = vec4(by_log_scale.yz, by_w, by_v.x);
-    splats[3u * i + 2u] = vec4(by_v.yz, by_logit, dm.x);
+    row_sums[at + L1_AT] = splats[splat + 2u];
+    for (var k = 0u; k < 3u; k++) {
+        splats[splat + k] = by_mean[k];
+        splats[splat + 3u + k] = by_log_scale[k];
+    }
+    splats[splat + 6u] = by_w;
+    splats[splat + 7u] = by_v.x;
+    splats[splat + 8u] = by_v.y;
 }
 
 // The gradient through the factor of opacities with antialiasing: with respect to log-scales, to rotations about

@@ -82,7 +82,6 @@ fn rasterize_bwd(
 
 // --- From records to one sum per row -------------------------------------------------------------------
 
-@group(0) @binding(9) var<storage, read> depths: array<u32>;
 @group(0) @binding(10) var<storage, read> slots_of_row: array<vec2<u32>>;
 @group(0) @binding(11) var<storage, read> all_records: array<f32>;
 @group(0) @binding(12) var<storage, read_write> row_sums: array<f32>;
@@ -91,7 +90,7 @@ fn rasterize_bwd(
 @compute @workgroup_size(256)
 fn gather(@builtin(global_invocation_id) id: vec3<u32>) {
     let row = index_of(id);
-    if row >= frame.model.x || depths[row] == NONE {
+    if row >= frame.model.x || !(splats[SPLAT * row + DEPTH] > 0.0) {
         return;
     }
     let slots = slots_of_row[row];

@@ -1,12 +1,10 @@
 // Stage 8: accumulates the requested signals over views, as in src/render/cpu/signals.rs. One row per
 // invocation. Each requested signal has planes of accumulators, with a number per row that is not frozen.
 
-@group(0) @binding(1) var<storage, read> state: State;
 @group(0) @binding(2) var<storage, read_write> signals: array<f32>;
 // The sums, and the derivatives that project_bwd.wgsl has left; see record.wgsl.
 @group(0) @binding(4) var<storage, read> row_sums: array<f32>;
-@group(0) @binding(5) var<storage, read> depths: array<u32>;
-@group(0) @binding(6) var<storage, read> splats: array<vec4<f32>>;
+@group(0) @binding(6) var<storage, read> splats: array<f32>;
 @group(0) @binding(7) var<storage, read> rows: array<RowPart>;
 @group(0) @binding(8) var<storage, read> ages: array<u32>;
 // Number of pixels that each row dominates, if they are counted.
@@ -65,17 +63,21 @@ fn raise(signal: u32, row: u32, value: f32) {
 @compute @workgroup_size(256)
 fn accumulate(@builtin(global_invocation_id) id: vec3<u32>) {
     let row = index_of(id);
-    if row < frame.frozen.x || row >= frame.model.x || state.short != 0u || depths[row] == NONE {
+    if row < frame.frozen.x || row >= frame.model.x {
+        return;
+    }
+    let splat = SPLAT * row;
+    let depth = splats[splat + DEPTH];
+    if !(depth > 0.0) {
         return;
     }
     let at = row * RECORD;
     let half = 0.5 * vec2<f32>(frame.image.xy);
-    let by_mean = splats[3u * row].xyz;
-    let by_projected = vec2(splats[3u * row + 2u].w, row_sums[at + MEAN_Y_AT]);
+    let by_mean = vec3(splats[splat], splats[splat + 1u], splats[splat + 2u]);
+    let by_projected = vec2(row_sums[at + MEAN_2D_AT], row_sums[at + MEAN_2D_AT + 1u]);
     let colour = at + COLOUR_AT;
     let by_colour = vec3(row_sums[colour], row_sums[colour + 1u], row_sums[colour + 2u]);
     add(VISIBLE_COUNT, row, 1.0);
-    let depth = bitcast<f32>(depths[row]);
     let full = frame.background.w;
     var weight = 1.0;
     if depth < full {

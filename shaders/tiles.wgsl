@@ -12,8 +12,9 @@
 @group(0) @binding(1) var<storage, read_write> state: State;
 // Workgroup counts of indirect dispatches, three numbers each; see ARGS_*.
 @group(0) @binding(2) var<storage, read_write> groups: array<u32>;
-@group(0) @binding(3) var<storage, read> depths: array<u32>;
-@group(0) @binding(4) var<storage, read> footprints: array<vec4<u32>>;
+// See splat.wgsl and footprint.wgsl.
+@group(0) @binding(3) var<storage, read> splats: array<f32>;
+@group(0) @binding(4) var<storage, read> footprints: array<vec2<u32>>;
 // Only read. Writable, because they may be ranges of the buffer that keys_out and values_out are in.
 @group(0) @binding(5) var<storage, read_write> keys_in: array<u32>;
 @group(0) @binding(6) var<storage, read_write> values_in: array<u32>;
@@ -28,27 +29,23 @@
 @group(0) @binding(13) var<storage, read_write> tile_starts: array<u32>;
 @group(0) @binding(14) var<storage, read_write> tile_counts: array<atomic<u32>>;
 
-// Items per workgroup and per invocation in prefix sums and sorts.
+// Items per workgroup and per invocation in prefix sums.
 const BLOCK: u32 = 2048u;
 const EACH: u32 = 8u;
 // Prefix sums saturate at this number, which is beyond any cap.
 const MOST: u32 = 0x40000000u;
 
-// Indices in `groups`.
-const ARGS_ROWS: u32 = 0u;
-const ARGS_ROW_BLOCKS: u32 = 3u;
-const ARGS_ROW_DIGITS: u32 = 6u;
-const ARGS_ENTRY_BLOCKS: u32 = 9u;
-const ARGS_ENTRY_DIGITS: u32 = 12u;
+// Indices in `groups`. The entries of a band in blocks of the sort.
+const ARGS_ENTRIES: u32 = 0u;
+// The kernels that change rows: by row, then those of the bands of colour.
+const ARGS_STEP: u32 = 3u;
+const ARGS_BANDS: u32 = 6u;
 
-// The numbers to sum (launch.a of scan_blocks and scan_sums). COUNTS_AGAIN: the entries of a band that the
-// total already includes.
-const FLAGS: u32 = 0u;
-const COUNTS_ALL: u32 = 1u;
-const COUNTS_BAND: u32 = 2u;
-const COUNTS_AGAIN: u32 = 3u;
-const DIGITS_OF_ROWS: u32 = 4u;
-const DIGITS_OF_ENTRIES: u32 = 5u;
+// The entries to count (launch.a of scan_blocks and scan_sums). COUNTS_AGAIN: those of a band that the total already
+// includes.
+const COUNTS_ALL: u32 = 0u;
+const COUNTS_BAND: u32 = 1u;
+const COUNTS_AGAIN: u32 = 2u;
 
 fn ceil_div(a: u32, b: u32) -> u32 {
     return (a + b - 1u) / b;
@@ -58,6 +55,17 @@ fn set_groups(at: u32, count: u32) {
     groups[at] = min(count, ACROSS);
     groups[at + 1u] = ceil_div(count, ACROSS);
     groups[at + 2u] = 1u;
+}
+
+// Decides if the step changes the model: not if it needs more bands than were encoded.
+fn conclude_bands(fits: bool) {
+    state.short = select(1u, 0u, fits);
+    let rows = select(0u, frame.model.x, fits);
+    set_groups(ARGS_STEP, ceil_div(rows, GROUP));
+    for (var band = 0u; band < 4u; band++) {
+        let pairs = (3u * (2u * band + 1u) + 1u) / 2u;
+        set_groups(ARGS_BANDS + 3u * band, ceil_div(rows * pairs, GROUP));
+    }
 }
 
 // --- Prefix sums --------------------------------------------------------------------------------
@@ -88,56 +96,46 @@ fn sum_before(lane: u32, value: u32) -> u32 {
     return before;
 }
 
-// The number of values to sum; `what`: see FLAGS.
-fn count_of(what: u32) -> u32 {
-    switch what {
-        case FLAGS: { return frame.model.x; }
-        case DIGITS_OF_ROWS: { return 16u * ceil_div(state.visible, BLOCK); }
-        case DIGITS_OF_ENTRIES: { return 16u * ceil_div(state.held, BLOCK); }
-        default: { return state.visible; }
+// Replaces eight numbers of each invocation, from `first` on, by their prefix sums, which start at `carry`; of all
+// numbers, those below `end` count.
+// The total is then in partial[255].
+fn scan(lane: u32, first: u32, end: u32, carry: u32) {
+    // Initialised explicitly: naga does not reset a variable in each round of a loop.
+    var values = array<u32, 8>();
+    var sum = 0u;
+    for (var k = 0u; k < EACH; k++) {
+        if first + k < end {
+            values[k] = sums[first + k];
+        }
+        sum = saturating(sum, values[k]);
+    }
+    var before = saturating(carry, sum_before(lane, sum));
+    for (var k = 0u; k < EACH; k++) {
+        if first + k < end {
+            sums[first + k] = before;
+        }
+        before = saturating(before, values[k]);
     }
 }
 
+// Prefix sums of the entries of each row, by blocks.
 @compute @workgroup_size(256)
 fn scan_blocks(
     @builtin(workgroup_id) id: vec3<u32>,
     @builtin(local_invocation_index) lane: u32,
 ) {
     let block = group_of(id);
-    let count = count_of(launch.a);
-    let first = block * BLOCK + lane * EACH;
-    var values: array<u32, 8>;
-    var sum = 0u;
-    for (var k = 0u; k < EACH; k++) {
-        let i = first + k;
-        var value = 0u;
-        if i < count {
-            if launch.a == FLAGS {
-                value = select(0u, 1u, depths[i] != NONE);
-            } else {
-                value = sums[i];
-            }
-        }
-        values[k] = value;
-        sum = saturating(sum, value);
-    }
-    var before = sum_before(lane, sum);
-    for (var k = 0u; k < EACH; k++) {
-        let i = first + k;
-        if i < count {
-            sums[i] = before;
-        }
-        before = saturating(before, values[k]);
-    }
-    if lane == 255u && block * BLOCK < count {
-        block_sums[block] = before;
+    let first = block * BLOCK;
+    scan(lane, first + lane * EACH, state.visible, 0u);
+    if lane == 0u && first < state.visible {
+        block_sums[block] = partial[255];
     }
 }
 
 // Prefix sums over blocks, and the results that depend on the total; a single group.
 @compute @workgroup_size(256)
 fn scan_sums(@builtin(local_invocation_index) lane: u32) {
-    let blocks = ceil_div(count_of(launch.a), BLOCK);
+    let blocks = ceil_div(state.visible, BLOCK);
     var carry = 0u;
     for (var start = 0u; start < blocks; start += BLOCK) {
         let first = start + lane * EACH;
@@ -169,24 +167,13 @@ fn scan_sums(@builtin(local_invocation_index) lane: u32) {
 // Stores the results that depend on the total; launch.b: number of bands whose passes were encoded.
 fn conclude(total: u32) {
     switch launch.a {
-        case FLAGS: {
-            state.visible = total;
-            set_groups(ARGS_ROWS, ceil_div(total, GROUP));
-            let blocks = ceil_div(total, BLOCK);
-            set_groups(ARGS_ROW_BLOCKS, blocks);
-            set_groups(ARGS_ROW_DIGITS, ceil_div(16u * blocks, BLOCK));
-            state.entries_low = 0u;
-            state.entries_high = 0u;
-            state.short = 0u;
-            state.bands = 1u;
-        }
         case COUNTS_ALL: {
             state.total = total;
             if launch.b == 1u {
                 // Passes were encoded for one band only. If the image needs more, the lists stay empty and
                 // no kernel changes the model.
                 let fits = total <= frame.model.z;
-                state.short = select(1u, 0u, fits);
+                conclude_bands(fits);
                 state.cuts[0] = 0u;
                 state.cuts[1] = frame.image.w;
                 set_held(select(0u, total, fits), true);
@@ -201,9 +188,7 @@ fn conclude(total: u32) {
 // Sets the number of entries of the current band, and adds it to the total if `is_new`.
 fn set_held(held: u32, is_new: bool) {
     state.held = held;
-    let blocks = ceil_div(held, BLOCK);
-    set_groups(ARGS_ENTRY_BLOCKS, blocks);
-    set_groups(ARGS_ENTRY_DIGITS, ceil_div(16u * blocks, BLOCK));
+    set_groups(ARGS_ENTRIES, ceil_div(held, SORTED));
     if is_new {
         let low = state.entries_low + held;
         state.entries_high += select(0u, 1u, low < held);
@@ -217,15 +202,30 @@ fn summed(i: u32) -> u32 {
 
 // --- Rows ---------------------------------------------------------------------------------------
 
-// Lists the rows on screen, in ascending order, with their depths.
-@compute @workgroup_size(256)
-fn compact(@builtin(global_invocation_id) id: vec3<u32>) {
-    let row = index_of(id);
-    if row < frame.model.x && depths[row] != NONE {
-        let to = summed(row);
-        keys_out[to] = depths[row];
-        values_out[to] = row;
-    }
+// A footprint, unpacked.
+struct Footprint {
+    // First and last tile.
+    low: vec2<u32>,
+    high: vec2<u32>,
+    // log2 of a block's width and height.
+    log2_block: vec2<u32>,
+    // Two spans each.
+    spans: vec2<u32>,
+}
+
+fn footprint_of(row: u32) -> Footprint {
+    let words = footprints[row];
+    let low = vec2(words.x, words.x >> 10u) & vec2(1023u);
+    let high = vec2(words.y, words.y >> 10u) & vec2(1023u);
+    let size = vec2(log2_block(high.x - low.x, LOG2_ACROSS), log2_block(high.y - low.y, LOG2_DOWN));
+    return Footprint(low, high, size, words >> vec2(20u));
+}
+
+// The first and the last block of a line of tiles; none if the first is beyond the last.
+fn span_of(f: Footprint, y: u32) -> vec2<u32> {
+    let line = (y - f.low.y) >> f.log2_block.y;
+    let span = select(f.spans.x, f.spans.y, line >= 2u) >> (6u * (line & 1u));
+    return vec2(span, span >> 3u) & vec2(7u);
 }
 
 // A run of tiles in one line of a footprint: columns first..=last.
@@ -234,11 +234,15 @@ struct Run {
     last: u32,
 }
 
-// The tiles of block `bit` in a line of tiles that are in the footprint and among the band's tiles
-// low..high; none if first > last. `before` is the line's first tile.
-fn run_of(x0: u32, x1: u32, log2_width: u32, bit: u32, before: u32, low: u32, high: u32) -> Run {
-    var first = x0 + (bit << log2_width);
-    var last = min(first + (1u << log2_width) - 1u, x1);
+// The tiles of a line that are in the footprint and among the band's tiles low..high; none if first > last. `before` is
+// the line's first tile.
+fn run_of(f: Footprint, y: u32, before: u32, low: u32, high: u32) -> Run {
+    let span = span_of(f, y);
+    if span.x > span.y {
+        return Run(1u, 0u);
+    }
+    var first = f.low.x + (span.x << f.log2_block.x);
+    var last = min(f.low.x + ((span.y + 1u) << f.log2_block.x) - 1u, f.high.x);
     if before + last < low || before + first >= high {
         return Run(1u, 0u);
     }
@@ -266,19 +270,13 @@ fn count_entries(@builtin(global_invocation_id) id: vec3<u32>) {
     if i >= state.visible {
         return;
     }
-    let f = footprints[order[i]];
+    let f = footprint_of(order[i]);
     let tiles = band();
-    let y0 = f.y & 0xffffu;
     var count = 0u;
-    for (var y = y0; y <= f.y >> 16u; y++) {
-        var bits = (f.z >> (8u * ((y - y0) >> (f.w >> 16u)))) & 0xffu;
-        while bits != 0u {
-            let bit = countTrailingZeros(bits);
-            bits &= bits - 1u;
-            let run = run_of(f.x & 0xffffu, f.x >> 16u, f.w & 0xffffu, bit, y * frame.image.z, tiles.x, tiles.y);
-            if run.first <= run.last {
-                count += run.last - run.first + 1u;
-            }
+    for (var y = f.low.y; y <= f.high.y; y++) {
+        let run = run_of(f, y, y * frame.image.z, tiles.x, tiles.y);
+        if run.first <= run.last {
+            count += run.last - run.first + 1u;
         }
     }
     sums[i] = min(count, MOST);
@@ -296,23 +294,17 @@ fn emit_entries(@builtin(global_invocation_id) id: vec3<u32>) {
         return;
     }
     let row = order[i];
-    let f = footprints[row];
+    let f = footprint_of(row);
     let tiles = band();
-    let y0 = f.y & 0xffffu;
     let first_slot = summed(i);
     var slot = first_slot;
-    for (var y = y0; y <= f.y >> 16u; y++) {
-        var bits = (f.z >> (8u * ((y - y0) >> (f.w >> 16u)))) & 0xffu;
-        while bits != 0u {
-            let bit = countTrailingZeros(bits);
-            bits &= bits - 1u;
-            let before = y * frame.image.z;
-            let run = run_of(f.x & 0xffffu, f.x >> 16u, f.w & 0xffffu, bit, before, tiles.x, tiles.y);
-            for (var x = run.first; x <= run.last; x++) {
-                keys_out[slot] = before + x;
-                values_out[slot] = row;
-                slot++;
-            }
+    for (var y = f.low.y; y <= f.high.y; y++) {
+        let before = y * frame.image.z;
+        let run = run_of(f, y, before, tiles.x, tiles.y);
+        for (var x = run.first; x <= run.last; x++) {
+            keys_out[slot] = before + x;
+            values_out[slot] = row;
+            slot++;
         }
     }
     store_slots(row, first_slot, slot - first_slot);
@@ -327,18 +319,12 @@ fn count_tiles(@builtin(global_invocation_id) id: vec3<u32>) {
     if i >= state.visible {
         return;
     }
-    let f = footprints[order[i]];
-    let y0 = f.y & 0xffffu;
-    for (var y = y0; y <= f.y >> 16u; y++) {
-        var bits = (f.z >> (8u * ((y - y0) >> (f.w >> 16u)))) & 0xffu;
-        while bits != 0u {
-            let bit = countTrailingZeros(bits);
-            bits &= bits - 1u;
-            let before = y * frame.image.z;
-            let run = run_of(f.x & 0xffffu, f.x >> 16u, f.w & 0xffffu, bit, before, 0u, frame.image.w);
-            for (var x = run.first; x <= run.last; x++) {
-                atomicAdd(&tile_counts[before + x], 1u);
-            }
+    let f = footprint_of(order[i]);
+    for (var y = f.low.y; y <= f.high.y; y++) {
+        let before = y * frame.image.z;
+        let run = run_of(f, y, before, 0u, frame.image.w);
+        for (var x = run.first; x <= run.last; x++) {
+            atomicAdd(&tile_counts[before + x], 1u);
         }
     }
 }
@@ -364,7 +350,7 @@ fn cut_bands() {
     }
     state.bands = band + 1u;
     let fits = band < launch.b;
-    state.short = select(1u, 0u, fits);
+    conclude_bands(fits);
     for (var k = 0u; k <= launch.b; k++) {
         if !fits {
             state.cuts[k] = 0u;
@@ -374,111 +360,217 @@ fn cut_bands() {
     }
 }
 
-// --- Stable sort, four bits at a time; launch.a: shift, launch.b: 1 to sort entries, 0 to sort rows,
-// launch.c: 1 if the values are the indices -----------------------------------------------------------
+// --- Stable sort, eight bits at a time; launch.a: shift, launch.b: the items (see FIRST_OF_ROWS), launch.c: 1 if the
+// values are the indices ------------------------------------------------------------------------------------
 
-var<workgroup> histogram: array<atomic<u32>, 16>;
+// The items to sort: all rows, whose keys are the bits of their depths, so that those not on screen are left out; the
+// rows on screen; the entries.
+const FIRST_OF_ROWS: u32 = 0u;
+const ROWS: u32 = 1u;
+const ENTRIES: u32 = 2u;
+
+// Invocations and items of a group, and the base of the digits.
+const SORTERS: u32 = 128u;
+const SORTED: u32 = 1024u;
+const DIGITS: u32 = 256u;
+// In place of an item: there is none.
+const ABSENT: u32 = 0xffffffffu;
+
+var<workgroup> histogram: array<atomic<u32>, DIGITS>;
 
 fn items() -> u32 {
-    return select(state.visible, state.held, launch.b == 1u);
+    switch launch.b {
+        case FIRST_OF_ROWS: { return frame.model.x; }
+        case ROWS: { return state.visible; }
+        default: { return state.held; }
+    }
 }
 
-fn digit_of(key: u32) -> u32 {
-    return (key >> launch.a) & 15u;
+// The digit of item i; ABSENT if there is no such item.
+fn digit_of(i: u32, count: u32) -> u32 {
+    if i >= count {
+        return ABSENT;
+    }
+    if launch.b != FIRST_OF_ROWS {
+        return (keys_in[i] >> launch.a) % DIGITS;
+    }
+    let depth = splats[SPLAT * i + DEPTH];
+    // The bits of positive numbers sort like the numbers.
+    return select(ABSENT, (bitcast<u32>(depth) >> launch.a) % DIGITS, depth > 0.0);
 }
 
-@compute @workgroup_size(256)
+// Counts each digit's items in each block.
+@compute @workgroup_size(128)
 fn count_digits(
     @builtin(workgroup_id) id: vec3<u32>,
     @builtin(local_invocation_index) lane: u32,
 ) {
     let block = group_of(id);
     let count = items();
-    if lane < 16u {
-        atomicStore(&histogram[lane], 0u);
+    for (var d = lane; d < DIGITS; d += SORTERS) {
+        atomicStore(&histogram[d], 0u);
     }
     workgroupBarrier();
-    let first = block * BLOCK + lane * EACH;
     for (var k = 0u; k < EACH; k++) {
-        if first + k < count {
-            atomicAdd(&histogram[digit_of(keys_in[first + k])], 1u);
+        let digit = digit_of(block * SORTED + k * SORTERS + lane, count);
+        if digit != ABSENT {
+            atomicAdd(&histogram[digit], 1u);
         }
     }
     workgroupBarrier();
-    let blocks = ceil_div(count, BLOCK);
-    if lane < 16u && block < blocks {
-        sums[lane * blocks + block] = atomicLoad(&histogram[lane]);
+    let blocks = ceil_div(count, SORTED);
+    for (var d = lane; d < DIGITS && block < blocks; d += SORTERS) {
+        sums[d * blocks + block] = atomicLoad(&histogram[d]);
     }
 }
 
-// Each invocation's counts of digits d and d + 8, in the halves of one word.
-var<workgroup> counters: array<u32, 2048>;
-// Start of each digit's items within the block.
-var<workgroup> digit_starts: array<u32, 16>;
-
+// Prefix sums of a digit's counts over the blocks, and its total; one group per digit.
 @compute @workgroup_size(256)
-fn scatter(
+fn scan_digits(
     @builtin(workgroup_id) id: vec3<u32>,
     @builtin(local_invocation_index) lane: u32,
 ) {
-    let block = group_of(id);
-    let count = items();
-    let first = block * BLOCK + lane * EACH;
-    for (var k = 0u; k < 8u; k++) {
-        counters[k * GROUP + lane] = 0u;
+    let blocks = ceil_div(items(), SORTED);
+    let from_block = id.x * blocks;
+    var total = 0u;
+    for (var start = 0u; start < blocks; start += BLOCK) {
+        scan(lane, from_block + start + lane * EACH, from_block + blocks, total);
+        total += partial[255];
+        workgroupBarrier();
     }
-    var keys: array<u32, 8>;
+    if lane == 0u {
+        block_sums[id.x] = total;
+    }
+}
+
+// Each invocation's counts of the values d and d + 8 of half a digit, in the halves of one word.
+var<workgroup> counters: array<u32, SORTED>;
+// The items of the block: digits and indices in the block.
+var<workgroup> packed: array<u32, SORTED>;
+var<workgroup> before_lanes: array<u32, SORTERS>;
+// Start of each digit's items within the block, and in the result.
+var<workgroup> digit_starts: array<u32, DIGITS>;
+var<workgroup> starts: array<u32, DIGITS>;
+
+// The sum of the values of this invocation and of the preceding ones, without carries between the halves of words; the
+// total is then in the last of before_lanes.
+fn sum_until(lane: u32, value: u32) -> u32 {
+    before_lanes[lane] = value;
+    workgroupBarrier();
+    for (var step = 1u; step < SORTERS; step *= 2u) {
+        var sum = before_lanes[lane];
+        if lane >= step {
+            sum += before_lanes[lane - step];
+        }
+        workgroupBarrier();
+        before_lanes[lane] = sum;
+        workgroupBarrier();
+    }
+    return before_lanes[lane];
+}
+
+// Sorts the items of the block by four bits, stably, without the absent ones; an invocation has eight neighbouring items.
+// Returns the number of items, which are then in `packed`.
+fn sort_by_half(lane: u32, shift: u32, own: ptr<function, array<u32, 8>>) -> u32 {
+    for (var k = 0u; k < 8u; k++) {
+        counters[k * SORTERS + lane] = 0u;
+    }
     for (var k = 0u; k < EACH; k++) {
-        if first + k < count {
-            keys[k] = keys_in[first + k];
-            let digit = digit_of(keys[k]);
-            counters[(digit & 7u) * GROUP + lane] += 1u << (16u * (digit >> 3u));
+        if (*own)[k] != ABSENT {
+            let half = ((*own)[k] >> shift) & 15u;
+            counters[(half & 7u) * SORTERS + lane] += 1u << (16u * (half >> 3u));
         }
     }
     workgroupBarrier();
-    // Prefix sums over digits, then invocations; the upper halves continue from the total of the lower.
+    // Prefix sums over values, then invocations; the upper halves continue from the total of the lower.
     var sum = 0u;
     for (var k = 0u; k < 8u; k++) {
         sum += counters[lane * 8u + k];
     }
-    partial[lane] = sum;
-    workgroupBarrier();
-    for (var step = 1u; step < GROUP; step *= 2u) {
-        var value = partial[lane];
-        if lane >= step {
-            value += partial[lane - step];
-        }
-        workgroupBarrier();
-        partial[lane] = value;
-        workgroupBarrier();
-    }
-    var running = partial[lane] - sum + (partial[255] << 16u);
+    var running = sum_until(lane, sum) - sum;
+    let all = before_lanes[SORTERS - 1u];
+    running += all << 16u;
     for (var k = 0u; k < 8u; k++) {
         let value = counters[lane * 8u + k];
         counters[lane * 8u + k] = running;
         running += value;
     }
     workgroupBarrier();
-    if lane < 16u {
-        digit_starts[lane] = (counters[(lane & 7u) * GROUP] >> (16u * (lane >> 3u))) & 0xffffu;
+    for (var k = 0u; k < EACH; k++) {
+        if (*own)[k] != ABSENT {
+            let half = ((*own)[k] >> shift) & 15u;
+            let word = (half & 7u) * SORTERS + lane;
+            let upper = 16u * (half >> 3u);
+            packed[(counters[word] >> upper) & 0xffffu] = (*own)[k];
+            counters[word] += 1u << upper;
+        }
     }
     workgroupBarrier();
-    let blocks = ceil_div(count, BLOCK);
+    return (all & 0xffffu) + (all >> 16u);
+}
+
+// Moves each item of a block to its place: first the block is sorted, so that items with the same digit are neighbours.
+@compute @workgroup_size(128)
+fn scatter(
+    @builtin(workgroup_id) id: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+) {
+    let block = group_of(id);
+    let first = block * SORTED;
+    let count = items();
+    let blocks = ceil_div(count, SORTED);
+    // Rows are dispatched as if all were on screen.
+    if block > 0u && block >= blocks {
+        return;
+    }
+    // Starts of the digits in the result.
+    let of_pair = vec2(block_sums[2u * lane], block_sums[2u * lane + 1u]);
+    let until = sum_until(lane, of_pair.x + of_pair.y);
+    starts[2u * lane] = until - of_pair.x - of_pair.y;
+    starts[2u * lane + 1u] = until - of_pair.y;
+    if launch.b == FIRST_OF_ROWS && block == 0u && lane == 0u {
+        state.visible = before_lanes[SORTERS - 1u];
+        state.entries_low = 0u;
+        state.entries_high = 0u;
+        state.bands = 1u;
+    }
+    workgroupBarrier();
+    var own: array<u32, 8>;
     for (var k = 0u; k < EACH; k++) {
-        let i = first + k;
-        if i < count {
-            let digit = digit_of(keys[k]);
-            let word = (digit & 7u) * GROUP + lane;
-            let half = 16u * (digit >> 3u);
-            let place = (counters[word] >> half) & 0xffffu;
-            counters[word] += 1u << half;
-            let to = summed(digit * blocks + block) + place - digit_starts[digit];
-            keys_out[to] = keys[k];
-            if launch.c == 1u {
-                values_out[to] = i;
-            } else {
-                values_out[to] = values_in[i];
-            }
+        let i = lane * EACH + k;
+        let digit = digit_of(first + i, count);
+        own[k] = select(digit << 16u | i, ABSENT, digit == ABSENT);
+    }
+    let held = sort_by_half(lane, 16u, &own);
+    for (var k = 0u; k < EACH; k++) {
+        let i = lane * EACH + k;
+        own[k] = ABSENT;
+        if i < held {
+            own[k] = packed[i];
+        }
+    }
+    workgroupBarrier();
+    _ = sort_by_half(lane, 20u, &own);
+    for (var i = lane; i < held; i += SORTERS) {
+        let digit = packed[i] >> 16u;
+        if i == 0u || packed[max(i, 1u) - 1u] >> 16u != digit {
+            digit_starts[digit] = i;
+        }
+    }
+    workgroupBarrier();
+    for (var i = lane; i < held; i += SORTERS) {
+        let digit = packed[i] >> 16u;
+        let from_item = first + (packed[i] & 0xffffu);
+        let to = starts[digit] + sums[digit * blocks + block] + i - digit_starts[digit];
+        if launch.b == FIRST_OF_ROWS {
+            keys_out[to] = bitcast<u32>(splats[SPLAT * from_item + DEPTH]);
+        } else {
+            keys_out[to] = keys_in[from_item];
+        }
+        if launch.c == 1u {
+            values_out[to] = from_item;
+        } else {
+            values_out[to] = values_in[from_item];
         }
     }
 }

@@ -6,7 +6,7 @@
 
 @group(0) @binding(1) var<storage, read_write> state: State;
 @group(0) @binding(4) var<storage, read> tile_starts: array<u32>;
-@group(0) @binding(5) var<storage, read> splats: array<vec4<f32>>;
+@group(0) @binding(5) var<storage, read> splats: array<f32>;
 
 // Number of invocations of a tile.
 const MEMBERS: u32 = 64u;
@@ -67,9 +67,13 @@ fn quad_of(tile: u32, lane: u32) -> Quad {
 
 // The splat of a row; `corner`: the tile's corner [px].
 fn splat_of(row: u32, corner: vec2<u32>) -> Splat {
-    let a = splats[3u * row];
-    let within = vec4(a.xy - vec2<f32>(corner), a.zw);
-    return Splat(within, splats[3u * row + 1u], splats[3u * row + 2u]);
+    let at = SPLAT * row;
+    let mean = vec2(splats[at], splats[at + 1u]) - vec2<f32>(corner);
+    return Splat(
+        vec4(mean, splats[at + 2u], splats[at + 3u]),
+        vec4(splats[at + 4u], splats[at + 5u], splats[at + DEPTH], 0.0),
+        vec4(splats[at + 6u], splats[at + 7u], splats[at + 8u], 0.0),
+    );
 }
 
 // A splat at the pixels: the pixels' whitened coordinates relative to the splat's mean, and log2 of its alpha there.

@@ -14,12 +14,13 @@ override ERROR_AT: u32;
 // This field is a maximum; the others are sums.
 override WEIGHT_MAX_AT: u32;
 
-// After project_bwd.wgsl, a row's splat is the derivatives with respect to: mean, log-scale x | log-scale y, z, quaternion
-// w, x | quaternion y, z, logit, projected mean x. Its sums are, in this order: the view direction, the derivative with
-// respect to the projected mean's y, a bit per channel whose colour is above its clamp at 0 (as a number), the splat's
-// l1; the others, from the colour on, stay sums.
-const DIRECTION_AT: u32 = 0u;
-const MEAN_Y_AT: u32 = 3u;
+// project_bwd.wgsl leaves derivatives in place of numbers that the rest of the step does not need. A row's splat then
+// begins with those with respect to: mean, log-scale, quaternion w, x, y. Its sums begin with those with respect to:
+// quaternion z, logit, projected mean. Then come a bit per channel whose colour is above its clamp at 0 (as a number), and
+// the splat's l1. The other sums, from the colour on, remain.
+const OF_SPLAT: u32 = 9u;
+const LOGIT_AT: u32 = 1u;
+const MEAN_2D_AT: u32 = 2u;
 const UNCLAMPED_AT: u32 = 4u;
 const L1_AT: u32 = 5u;
 const COLOUR_AT: u32 = 6u;

@@ -43,7 +43,7 @@ struct State {
     total: u32,
     // Number of bands that the image needs.
     bands: u32,
-    // 1: more bands are needed than were encoded; the step must change nothing.
+    // 1: more bands are needed than were encoded; no kernel that changes rows is then dispatched.
     short: u32,
     // Number of entries of all bands, in 64 bits.
     entries_low: u32,

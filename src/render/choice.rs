@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use super::cpu::CpuBackend;
 use super::gpu::{GpuDevice, adapters, may_be_present};
-use super::{Accumulation, AdapterChoice, AdapterSummary, Backend, BackendError, Setup};
+use super::{Accumulation, AdapterChoice, AdapterSummary, Backend, BackendError, Setup, Storage};
 use densify_core::gaussians::Gaussians;
 use densify_core::memory::Ledger;
 
@@ -173,15 +173,15 @@ impl Device {
         }
     }
 
-    /// Compiles the GPU kernels for these needs and verifies their results on a small scene. Done before memory is
+    /// Compiles the GPU kernels for these needs and this storage and verifies their results on a small scene. Done before memory is
     /// planned: the plan must include the memory that the driver takes.
     ///
     /// # Errors
     /// When a kernel does not compile or its results are wrong.
-    pub fn prove(&self, needs: &Needs) -> Result<(), BackendError> {
+    pub fn prove(&self, needs: &Needs, storage: Storage) -> Result<(), BackendError> {
         match self {
             Self::Processor => Ok(()),
-            Self::Gpu(device) => device.run_canary(needs),
+            Self::Gpu(device) => device.run_canary(needs, storage),
         }
     }
 

@@ -48,6 +48,9 @@ pub use inspect::{Inspect, RowWeights, SurfaceDepths};
 pub use setup::{KeptPhotographs, MomentStorage, ParameterStorage, Setup, Shortcuts, Storage};
 pub use state::{StateArray, StateError, Tensor, Values};
 
+/// Side of a tile, of all backends `[px]`.
+pub const TILE: u32 = 16;
+
 /// Learning rates of one iteration. If all are 0, the default, the model is unchanged, but signals are still measured.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct LearningRates {

@@ -2,7 +2,9 @@
 
 use densify_policies::policy::Needs;
 
-use super::{Accumulation, AdapterChoice, AdapterSummary, BackendError, Differentiable, Setup};
+use super::{
+    Accumulation, AdapterChoice, AdapterSummary, BackendError, Differentiable, Setup, Storage,
+};
 use densify_core::gaussians::Gaussians;
 use densify_core::memory::Ledger;
 
@@ -36,7 +38,7 @@ impl GpuDevice {
         match *self {}
     }
 
-    pub(super) fn run_canary(&self, _: &Needs) -> Result<(), BackendError> {
+    pub(super) fn run_canary(&self, _: &Needs, _: Storage) -> Result<(), BackendError> {
         match *self {}
     }
 

@@ -111,9 +111,16 @@ impl Ledger {
         peak(&lines.collect::<Vec<_>>())
     }
 
-    /// Sum of all buffers in GPU memory `[bytes]`. They stay allocated from the start of training to the run's end.
+    /// Peak GPU memory `[bytes]`: all buffers that stay allocated from the start of training to the run's end, or those
+    /// before.
     pub fn on_device(&self) -> u64 {
-        sum(self.lines.iter().filter(|line| line.on_device).map(|line| line.bytes))
+        let (before, lasting): (Vec<_>, Vec<_>) = self
+            .lines
+            .iter()
+            .filter(|line| line.on_device)
+            .partition(|line| line.section == Section::Before);
+        let before = before.iter().map(|line| line.bytes).max().unwrap_or(0);
+        before.max(sum(lasting.iter().map(|line| line.bytes)))
     }
 }
 
@@ -129,18 +136,21 @@ fn peak(lines: &[&LedgerLine]) -> u64 {
 /// Finds the lines whose buffers exist at the peak: those of the process and those of the largest phase.
 ///
 /// Only the largest line counts in each of [`Section::Passing`], [`Section::Before`] and [`Section::After`], as the
-/// buffers of such a section never coexist. Buffers in GPU memory coexist with those of [`Section::After`], but not
-/// with those of [`Section::Before`].
+/// buffers of such a section never coexist; in [`Section::Before`], the largest in GPU memory counts too. All other buffers
+/// in GPU memory coexist with those of [`Section::After`], but not with those of [`Section::Before`].
 fn held_at_peak(lines: &[&LedgerLine]) -> Vec<bool> {
-    let largest = |section| {
-        let indices = (0..lines.len()).filter(|&i| lines[i].section == section);
-        indices.rev().max_by_key(|&i| lines[i].bytes)
+    let largest = |section, on_device| {
+        let is_one = |i: &usize| lines[*i].section == section && lines[*i].on_device == on_device;
+        (0..lines.len()).filter(is_one).rev().max_by_key(|&i| lines[i].bytes)
     };
-    let [passing, before, after] = [Section::Passing, Section::Before, Section::After].map(largest);
+    let [passing, before, after] =
+        [Section::Passing, Section::Before, Section::After].map(|section| largest(section, false));
+    let before_on_device = largest(Section::Before, true);
+    let is_before = |i: usize| lines[i].section == Section::Before;
     let is_lasting = |i: usize| lines[i].section < Section::Passing;
     let phases: [&dyn Fn(usize) -> bool; 3] = [
-        &|i| Some(i) == before,
-        &|i| after.is_some() && (Some(i) == after || lines[i].on_device),
+        &|i| Some(i) == before || Some(i) == before_on_device,
+        &|i| after.is_some() && (Some(i) == after || (lines[i].on_device && !is_before(i))),
         &|i| Some(i) == passing || is_lasting(i),
     ];
     let bytes = |is_held: &&dyn Fn(usize) -> bool| {
@@ -236,6 +246,12 @@ mod tests {
         assert_eq!(ledger.total(), 42 << 20);
         ledger.add_on_device(Section::Renderer, "on the device", 2 << 20);
         assert_eq!((ledger.total(), ledger.on_host()), (44 << 20, 41 << 20));
+        // Of buffers in GPU memory, those before training and the others never coexist.
+        ledger.add_on_device(Section::Before, "measuring there", 1 << 20);
+        assert_eq!((ledger.total(), ledger.on_device()), (44 << 20, 2 << 20));
+        ledger.add_on_device(Section::Before, "measuring more there", 50 << 20);
+        assert_eq!((ledger.total(), ledger.on_host()), (91 << 20, 41 << 20));
+        assert_eq!(ledger.on_device(), 50 << 20);
     }
 
     #[test]

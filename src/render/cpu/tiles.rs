@@ -31,7 +31,8 @@ use super::simd::WIDTH;
 use super::threads::Threads;
 
 /// Side of a tile `[px]`.
-pub(super) const TILE: usize = WIDTH;
+pub(super) const TILE: usize = crate::TILE as usize;
+const _: () = assert!(TILE == WIDTH, "a tile is as wide as a vector");
 /// Maximum number of counters, one per (chunk of rows, tile): 16 MiB.
 const MAX_COUNTERS: usize = 1 << 22;
 /// Maximum number of chunks of rows: four for each of 64 threads.

@@ -2,7 +2,7 @@
 
 use super::GpuBackend;
 use super::launches::{Audit, MOMENT_MARKS};
-use super::passes::Recorder;
+use super::passes::{Record, Recorder};
 use crate::{BackendError, NonFinite, NumberKind};
 use densify_core::gaussians::ModelArray;
 
@@ -12,9 +12,10 @@ impl GpuBackend {
         let rows = self.rows as u32;
         let bytes = 4 * u64::from(rows);
         let mut encoder = self.device.device.create_command_encoder(&Default::default());
-        encoder.clear_buffer(self.buffers.get("sums"), 0, Some(bytes.next_multiple_of(16)));
+        let (buffer, first) = self.buffers.place("sums");
+        encoder.clear_buffer(buffer, first, Some(bytes.next_multiple_of(16)));
         let pass = encoder.begin_compute_pass(&Default::default());
-        let mut to = Recorder::new(pass);
+        let mut to = Recorder::new(pass, self.buffers.get("groups"));
         for Audit { launch, first_row, numbers, mark } in &self.launches.audits {
             let groups = rows.saturating_sub(*first_row).div_ceil(256);
             to.run(launch, [rows, *numbers, *mark, *first_row], groups);

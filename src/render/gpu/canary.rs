@@ -8,7 +8,7 @@ use glam::{DMat3, DVec3};
 use super::{GpuBackend, GpuDevice};
 use crate::cpu::CpuBackend;
 use crate::signals::RecordLayout;
-use crate::{Backend, BackendError, LearningRates, Setup, StepInput, StepOutput};
+use crate::{Backend, BackendError, LearningRates, Setup, StepInput, StepOutput, Storage};
 use densify_core::antialiasing::Antialiasing;
 use densify_core::camera::Camera;
 use densify_core::gaussians::{Gaussians, sh_coefficients};
@@ -110,29 +110,30 @@ impl GpuBackend {
         options: &Setup,
         device: &GpuDevice,
     ) -> Result<Self, BackendError> {
-        device.run_canary(&options.needs)?;
+        device.run_canary(&options.needs, options.storage)?;
         Self::without_canary(model, options, device)
     }
 }
 
 impl GpuDevice {
-    /// Compares the device with the native backend, once per set of kernels that a policy's needs require, with
-    /// parameters and moments in f32. Afterwards the memory of the process includes the driver's.
+    /// Compares the device with the native backend, once per set of kernels that a policy's needs and the storage of
+    /// numbers require. Afterwards the memory of the process includes the driver's.
     ///
     /// # Errors
     /// As [`GpuBackend::new`].
-    pub fn run_canary(&self, needs: &Needs) -> Result<(), BackendError> {
-        self.0.check_once(RecordLayout::new(needs.signals, false), || check(self, needs))
+    pub fn run_canary(&self, needs: &Needs, storage: Storage) -> Result<(), BackendError> {
+        let kernels = (RecordLayout::new(needs.signals, false), storage);
+        self.0.check_once(kernels, || check(self, needs, storage))
     }
 }
 
-/// Compares the device with the native backend, with the kernels that these needs require.
+/// Compares the device with the native backend, with the kernels that these needs and this storage require.
 ///
 /// # Errors
 /// [`BackendError::Device`] with the difference.
-fn check(device: &GpuDevice, needs: &Needs) -> Result<(), BackendError> {
+fn check(device: &GpuDevice, needs: &Needs, storage: Storage) -> Result<(), BackendError> {
     let (model, camera, target) = scene();
-    let mut options = Setup { threads: Some(1), ..Setup::new(model.len()) };
+    let mut options = Setup { threads: Some(1), storage, ..Setup::new(model.len()) };
     let mut cpu = CpuBackend::new(&model, &options)?;
     options.largest_image = (camera.width, camera.height);
     options.needs.signals = needs.signals;

@@ -2,35 +2,39 @@
 
 use super::GpuBackend;
 use super::frame::{Frame, State, grid};
+use super::rows::{DEPTH, SPLAT};
+use glam::Vec3;
+
 use crate::cpu::{EXPONENT_SCALE, ModelGradient};
 use crate::signals::{Field, RecordLayout};
 use crate::{BackendError, Differentiable, ImageGradient, Rendering, StepOutput};
 use densify_core::camera::Camera;
-use densify_core::gaussians::sh_coefficients;
+use densify_core::gaussians::{ModelArray, sh_coefficients};
 use densify_core::image::Image8;
 use densify_core::sh;
 
 impl GpuBackend {
     /// Reads the gradients that stages 5 and 6 have left; see `shaders/shared/record.wgsl`.
-    fn model_gradient(&self, degree: u8) -> Result<ModelGradient, BackendError> {
-        let n = self.rows as u64;
+    fn model_gradient(&self, frame: &Frame) -> Result<ModelGradient, BackendError> {
+        let (n, degree) = (self.rows as u64, frame.model[1] as u8);
+        let gradient = self.read("splats", 0, (4 * SPLAT) as u64 * n)?;
         let sums = self.read("row sums", 0, 4 * RecordLayout::MOST as u64 * n)?;
-        let gradient = self.read("splats", 0, 48 * n)?;
-        let depths = self.read("depths", 0, 4 * n)?;
+        let means = ModelArray::Means.parameters(self.sizes.sh_degree);
+        let means = self.parameters_of(&means, 0..self.rows)?;
         let planes = 3 * sh_coefficients(self.sizes.sh_degree);
         let mut out = ModelGradient { sh: vec![0.0; planes * self.rows], ..Default::default() };
-        let rows = gradient.as_chunks::<12>().0.iter().zip(depths);
+        let rows = gradient.as_chunks::<SPLAT>().0.iter().zip(means.as_chunks::<3>().0);
         let sums = sums.as_chunks::<{ RecordLayout::MOST }>().0;
-        for (row, ((g, depth), sums)) in rows.zip(sums).enumerate() {
-            let seen = depth.to_bits() != u32::MAX;
+        for (row, ((g, mean), sums)) in rows.zip(sums).enumerate() {
+            let seen = g[DEPTH] > 0.0;
             let sums = if seen { *sums } else { [0.0; RecordLayout::MOST] };
-            let [dx, dy, dz, mean_y, unclamped, l1, ..] = sums;
+            let [quat_z, logit, x, y, unclamped, l1, ..] = sums;
             let unscale = 1.0 / EXPONENT_SCALE;
             out.means.push([g[0], g[1], g[2]]);
             out.log_scales.push([g[3], g[4], g[5]]);
-            out.quats.push([g[6], g[7], g[8], g[9]]);
-            out.opacity_logits.push(g[10]);
-            out.mean2d.push([g[11], mean_y]);
+            out.quats.push([g[6], g[7], g[8], quat_z]);
+            out.opacity_logits.push(logit);
+            out.mean2d.push([x, y]);
             let sum = |field: Field| sums[field.number()];
             out.mean2d_abs.push([
                 l1 * unscale * unscale * sum(Field::AbsX),
@@ -43,7 +47,9 @@ impl GpuBackend {
             out.visible.push(seen);
             let mut y = [0.0_f32; 16];
             y[0] = sh::C0;
-            sh::basis(degree, [dx, dy, dz], &mut y);
+            let [cx, cy, cz, _] = frame.centre;
+            let towards = Vec3::from(*mean) - Vec3::new(cx, cy, cz);
+            sh::basis(degree, towards.normalize_or_zero().into(), &mut y);
             for (k, basis) in y.iter().enumerate().take(sh_coefficients(degree)) {
                 for channel in (0..3).filter(|channel| unclamped as u32 >> channel & 1 == 1) {
                     out.sh[row * planes + 3 * k + channel] = basis * sums[6 + channel];
@@ -69,7 +75,8 @@ impl Differentiable for GpuBackend {
             self.rebuild()?;
         }
         self.fit_image(camera.width, camera.height)?;
-        let pixels = upstream.rgb.as_chunks::<3>().0.iter().zip(&upstream.alpha).zip(&upstream.depth);
+        let pixels =
+            upstream.rgb.as_chunks::<3>().0.iter().zip(&upstream.alpha).zip(&upstream.depth);
         let gradient = pixels.map(|((&[r, g, b], &a), &z)| [r, g, b, z, a, 0.0, 0.0, 0.0]);
         self.write("pixel gradient", bytemuck::cast_slice(&gradient.collect::<Vec<_>>()));
         let frame = self.frame(camera, background, sh_degree);
@@ -79,7 +86,7 @@ impl Differentiable for GpuBackend {
             passes.differentiate(to);
         })?;
         let rendering = self.rendering(camera.width, camera.height, false)?;
-        Ok((rendering, self.model_gradient(frame.model[1] as u8)?))
+        Ok((rendering, self.model_gradient(&frame)?))
     }
 
     fn loss(

@@ -10,7 +10,7 @@ use densify_policies::policy::Signal;
 use super::GpuBackend;
 use super::frame::folded_seed;
 use super::launches::{Launch, RowLaunch};
-use super::passes::Recorder;
+use super::passes::{Record, Recorder};
 use super::rows::Edited;
 use super::sizes::OPS_BYTES;
 use densify_core::gaussians::{ModelArray, logit, rgb_to_dc};

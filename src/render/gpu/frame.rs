@@ -6,12 +6,9 @@ use densify_policies::policy::{ErrorScore, Signal};
 
 use crate::cpu::{SSIM_WEIGHT, ViewParams};
 use crate::signals::SignalPlanes;
-use crate::{StepInput, StepOutput};
+use crate::{StepInput, StepOutput, TILE};
 use densify_core::antialiasing::Antialiasing;
 use densify_core::camera::Camera;
-
-/// Side of a tile `[px]`.
-pub(super) const TILE: u32 = 16;
 
 /// See `Frame` in `shaders/shared/view.wgsl`.
 #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]

@@ -198,10 +198,10 @@ pub(super) fn rebound(sizes: &Sizes) -> HashMap<&'static str, Vec<Vec<Rebinding>
         others.chain(moments(part)).collect()
     };
     // Without and with an exposure.
-    let images = vec![vec![], vec![("canvas", "exposed")]];
+    let derivatives = ("derivatives", sizes.derivatives());
+    let images = vec![vec![derivatives], vec![derivatives, ("canvas", "exposed")]];
     let keys_in = two(&|i| vec![("keys in", KEYS[i])]);
     HashMap::from([
-        ("compact", vec![vec![("keys out", KEYS[0]), ("values out", VALUES[0])]]),
         ("count_digits", keys_in.clone()),
         ("find_tiles", keys_in),
         // The first four by the numbers of their keys and values; the fifth writes the order of rows.

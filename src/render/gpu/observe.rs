@@ -9,7 +9,8 @@ use densify_policies::policy::{
 
 use super::GpuBackend;
 use super::frame::Frame;
-use super::passes::{Search, Shape};
+use super::passes::{ErrorPlace, Search, Shape};
+use super::rows::{DEPTH, SPLAT};
 use super::sizes::OPS_BYTES;
 use crate::candidates::{Photograph, count_to_rank};
 use crate::cpu::EXPONENT_SCALE;
@@ -41,8 +42,16 @@ impl GpuBackend {
             wanted: wanted as u32,
             room: room as u32,
             min_alpha: request.min_alpha,
-            of_gradient: request.error == ErrorMode::Gradient,
+            error: self.error_place(request),
         })
+    }
+
+    fn error_place(&self, request: &CandidateRequest) -> ErrorPlace {
+        match request.error {
+            ErrorMode::Gradient => ErrorPlace::Gradient,
+            ErrorMode::L1 | ErrorMode::L1Dssim if self.sizes.with_error => ErrorPlace::Buffer,
+            ErrorMode::L1 | ErrorMode::L1Dssim => ErrorPlace::Canvas,
+        }
     }
 
     /// Adds the pixels with the largest errors to the candidates. `search` is the search that the device has done, if
@@ -98,13 +107,16 @@ impl GpuBackend {
         let pixels = width * height;
         // Per pixel: its final transmittance and its last entry.
         let finish = self.read("finish", 0, 8 * pixels as u64)?;
-        let error: Vec<f32> = match request.error {
-            ErrorMode::Gradient => {
-                let gradient = self.read("canvas", 0, 16 * pixels as u64)?;
-                let colours = gradient.as_chunks::<4>().0.iter();
-                colours.map(|[r, g, b, _]| (r * r + g * g + b * b).sqrt()).collect()
-            }
-            ErrorMode::L1 | ErrorMode::L1Dssim => self.read("error", 0, 4 * pixels as u64)?,
+        let place = self.error_place(request);
+        let error: Vec<f32> = if place == ErrorPlace::Buffer {
+            self.read("error", 0, 4 * pixels as u64)?
+        } else {
+            let canvas = self.read("canvas", 0, 16 * pixels as u64)?;
+            let error = |&[r, g, b, error]: &[f32; 4]| match place {
+                ErrorPlace::Gradient => (r * r + g * g + b * b).sqrt(),
+                ErrorPlace::Canvas | ErrorPlace::Buffer => error,
+            };
+            canvas.as_chunks::<4>().0.iter().map(error).collect()
         };
         let at = |x: usize, y: usize| {
             let pixel = y * width + x;
@@ -196,12 +208,12 @@ impl GpuBackend {
     fn columns(&self, request: &AuxRequest) -> Result<Vec<(AuxColumn, Vec<f32>)>, BackendError> {
         let n = self.rows as u64;
         let sums = self.read("row sums", 0, 20 * n)?;
-        let splats = self.read("splats", 0, 48 * n)?;
-        let depths = self.read("depths", 0, 4 * n)?;
+        let splats = self.read("splats", 0, (4 * SPLAT) as u64 * n)?;
         let counted = if self.sizes.counts_dominant { n } else { 0 };
         let dominant = self.read("dominant", 0, 4 * counted)?;
         let value = |column: AuxColumn, row: usize| {
-            if depths[row].to_bits() == u32::MAX {
+            let splat = &splats[SPLAT * row..SPLAT * (row + 1)];
+            if splat[DEPTH] <= 0.0 {
                 return 0.0;
             }
             match column {
@@ -211,9 +223,9 @@ impl GpuBackend {
                 AuxColumn::DistanceSum => sums[5 * row + 3],
                 AuxColumn::WeightMax => sums[5 * row + 4],
                 AuxColumn::DominantPixels => dominant[row].to_bits() as f32,
-                AuxColumn::Depth => depths[row],
+                AuxColumn::Depth => splat[DEPTH],
                 AuxColumn::Radius => {
-                    let [_, _, l1, shear, l3] = [0, 1, 2, 3, 4].map(|i| splats[12 * row + i]);
+                    let [l1, shear, l3] = [2, 3, 4].map(|i| splat[i]);
                     radius_px(EXPONENT_SCALE / l1, shear, EXPONENT_SCALE / l3)
                 }
             }

@@ -7,26 +7,29 @@ use wgpu::ComputePass;
 use super::clock::Stages;
 use super::exposure::groups;
 use super::launches::{Launch, Launches};
-use super::sizes::BLOCK;
+use super::sizes::{BLOCK, SORTED};
 use densify_core::gaussians::logit;
 
 /// Workgroups along the first of two dimensions; see `shaders/shared/view.wgsl`.
 const ACROSS: u32 = 32_768;
 /// Offsets of indirect dispatch sizes `[bytes]`; see `shaders/tiles.wgsl`.
 mod args {
-    pub(super) const ROWS: u64 = 0;
-    pub(super) const ROW_BLOCKS: u64 = 12;
-    pub(super) const ROW_DIGITS: u64 = 24;
-    pub(super) const ENTRY_BLOCKS: u64 = 36;
-    pub(super) const ENTRY_DIGITS: u64 = 48;
+    pub(super) const ENTRIES: u64 = 0;
+    pub(super) const STEP: u64 = 12;
+    pub(super) const BANDS: u64 = 24;
 }
-/// Quantities of which prefix sums are computed; see `shaders/tiles.wgsl`.
-const FLAGS: u32 = 0;
-const COUNTS_ALL: u32 = 1;
-const COUNTS_BAND: u32 = 2;
-const COUNTS_AGAIN: u32 = 3;
-const DIGITS_OF_ROWS: u32 = 4;
-const DIGITS_OF_ENTRIES: u32 = 5;
+/// The entries of which prefix sums are computed; see `shaders/tiles.wgsl`.
+const COUNTS_ALL: u32 = 0;
+const COUNTS_BAND: u32 = 1;
+const COUNTS_AGAIN: u32 = 2;
+/// The items that a sort takes; see `shaders/tiles.wgsl`.
+const FIRST_OF_ROWS: u32 = 0;
+const ROWS: u32 = 1;
+const ENTRIES: u32 = 2;
+/// Number of eight-bit digits of a depth.
+const DEPTH_DIGITS: u32 = 4;
+/// Number of values of a digit.
+const DIGITS: u32 = 256;
 /// The launch of `scatter` that writes the order of rows.
 const TO_ORDER: usize = 4;
 /// Band number that stands for the whole image.
@@ -45,10 +48,18 @@ pub(super) struct Shape {
 }
 
 impl Shape {
-    /// Number of four-bit digits that sort the entries by tile.
+    /// Number of eight-bit digits that sort the entries by tile.
     fn tile_digits(&self) -> u32 {
-        (u32::BITS - (self.tiles - 1).leading_zeros()).div_ceil(4).max(1)
+        (u32::BITS - (self.tiles - 1).leading_zeros()).div_ceil(8).max(1)
     }
+}
+
+/// The place of the errors of pixels: a buffer of their own, or the canvas, whose first three numbers are the gradient.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum ErrorPlace {
+    Buffer,
+    Gradient,
+    Canvas,
 }
 
 /// A search for the pixels of a view with the largest errors.
@@ -62,24 +73,31 @@ pub(super) struct Search {
     pub(super) room: u32,
     /// Smallest alpha of a pixel that may be selected.
     pub(super) min_alpha: f32,
-    /// True if the error is the length of the loss's gradient.
-    pub(super) of_gradient: bool,
+    pub(super) error: ErrorPlace,
+}
+
+/// Takes the dispatches of a view's passes: encodes them, or, in a test, counts them.
+pub(super) trait Record<L> {
+    /// Begins a stage.
+    fn stage(&mut self, name: &'static str);
+
+    /// Dispatches this number of workgroups.
+    fn run(&mut self, launch: &L, immediates: [u32; 4], groups: u32);
+
+    /// Dispatches the number of workgroups that the device has counted and stored at byte `at` of the buffer "groups".
+    fn run_counted(&mut self, launch: &L, immediates: [u32; 4], at: u64);
 }
 
 /// Encodes dispatches into one pass.
 pub(super) struct Recorder<'e> {
     pass: ComputePass<'e>,
+    groups: &'e wgpu::Buffer,
     pub(super) stages: Stages<'e>,
 }
 
 impl<'e> Recorder<'e> {
-    pub(super) fn new(pass: ComputePass<'e>) -> Self {
-        Self { pass, stages: Stages::default() }
-    }
-
-    /// Encodes the beginning of a stage.
-    fn stage(&mut self, name: &'static str) {
-        self.stages.begin(&mut self.pass, name);
+    pub(super) fn new(pass: ComputePass<'e>, groups: &'e wgpu::Buffer) -> Self {
+        Self { pass, groups, stages: Stages::default() }
     }
 
     /// Ends the pass and returns the names of its stages; the last, empty name marks the end.
@@ -93,56 +111,57 @@ impl<'e> Recorder<'e> {
         self.pass.set_bind_group(0, &launch.bindings, &[]);
         self.pass.set_immediates(0, bytemuck::bytes_of(&immediates));
     }
+}
 
-    /// Dispatches this number of workgroups.
-    pub(super) fn run(&mut self, launch: &Launch, immediates: [u32; 4], groups: u32) {
+impl Record<Launch> for Recorder<'_> {
+    fn stage(&mut self, name: &'static str) {
+        self.stages.begin(&mut self.pass, name);
+    }
+
+    fn run(&mut self, launch: &Launch, immediates: [u32; 4], groups: u32) {
         if groups > 0 {
             self.set(launch, immediates);
             self.pass.dispatch_workgroups(groups.min(ACROSS), groups.div_ceil(ACROSS), 1);
         }
     }
 
-    /// Dispatches the number of workgroups that the device has counted.
-    fn run_counted(
-        &mut self,
-        launch: &Launch,
-        immediates: [u32; 4],
-        groups: &wgpu::Buffer,
-        at: u64,
-    ) {
+    fn run_counted(&mut self, launch: &Launch, immediates: [u32; 4], at: u64) {
         self.set(launch, immediates);
-        self.pass.dispatch_workgroups_indirect(groups, at);
+        self.pass.dispatch_workgroups_indirect(self.groups, at);
     }
 }
 
 /// The passes of one view.
-pub(super) struct Passes<'a> {
-    pub(super) launches: &'a Launches,
-    pub(super) groups: &'a wgpu::Buffer,
+pub(super) struct Passes<'a, L = Launch> {
+    pub(super) launches: &'a Launches<L>,
     pub(super) shape: Shape,
 }
 
-impl Passes<'_> {
-    /// Sorts by one digit, stably. `items` is 1 for entries and 0 for rows.
-    fn sort_digit(&self, to: &mut Recorder<'_>, digit: u32, items: u32, scatter: &Launch) {
+impl<L> Passes<'_, L> {
+    /// Sorts by one digit, stably; `items`: see [`FIRST_OF_ROWS`].
+    fn sort_digit(&self, to: &mut impl Record<L>, digit: u32, items: u32, scatter: &L) {
         let l = self.launches;
-        let source = (digit % 2) as usize;
-        let (blocks, digits, sum) = if items == 1 {
-            (args::ENTRY_BLOCKS, args::ENTRY_DIGITS, DIGITS_OF_ENTRIES)
+        // The values of the first digit are the indices of the rows, or, with slots, of the entries.
+        let of_indices = items == FIRST_OF_ROWS || l.in_slots && items == ENTRIES && digit == 0;
+        let immediates = [8 * digit, items, u32::from(of_indices), 0];
+        let count = l.nth("count_digits", (digit % 2) as usize);
+        // At least one group, which counts the rows on screen.
+        let blocks = self.shape.rows.div_ceil(SORTED as u32).max(1);
+        if items == ENTRIES {
+            to.run_counted(count, immediates, args::ENTRIES);
         } else {
-            (args::ROW_BLOCKS, args::ROW_DIGITS, DIGITS_OF_ROWS)
-        };
-        // With slots, the values of the first digit are the indices of the entries.
-        let of_indices = l.in_slots && items == 1 && digit == 0;
-        let immediates = [4 * digit, items, u32::from(of_indices), 0];
-        to.run_counted(l.nth("count_digits", source), immediates, self.groups, blocks);
-        to.run_counted(l.get("scan_blocks"), [sum, 0, 0, 0], self.groups, digits);
-        to.run(l.get("scan_sums"), [sum, 0, 0, 0], 1);
-        to.run_counted(scatter, immediates, self.groups, blocks);
+            to.run(count, immediates, blocks);
+        }
+        to.run(l.get("scan_digits"), immediates, DIGITS);
+        if items == ENTRIES {
+            to.run_counted(scatter, immediates, args::ENTRIES);
+        } else {
+            to.run(scatter, immediates, blocks);
+        }
     }
 
     /// Stages 1–3. Afterwards the canvas holds the image, and the lists hold the entries of the last band.
-    pub(super) fn forward(&self, to: &mut Recorder<'_>) {
+    pub(super) fn forward(&self, to: &mut impl Record<L>) {
         let l = self.launches;
         let Shape { rows, bands, .. } = self.shape;
         to.stage("project");
@@ -150,18 +169,17 @@ impl Passes<'_> {
         if l.counts_dominant {
             to.run(l.get("clear_dominant"), [0; 4], rows.div_ceil(256));
         }
-        to.run(l.get("scan_blocks"), [FLAGS, 0, 0, 0], rows.div_ceil(BLOCK as u32));
-        to.run(l.get("scan_sums"), [FLAGS, bands, 0, 0], 1);
-        to.run(l.get("compact"), [0; 4], rows.div_ceil(256));
         to.stage("sort by depth");
-        for digit in 0..8 {
-            let number = if digit == 7 { TO_ORDER } else { 3 * (digit as usize % 2) };
-            self.sort_digit(to, digit, 0, l.nth("scatter", number));
+        for digit in 0..DEPTH_DIGITS {
+            let is_last = digit == DEPTH_DIGITS - 1;
+            let number = if is_last { TO_ORDER } else { 3 * (digit as usize % 2) };
+            let items = if digit == 0 { FIRST_OF_ROWS } else { ROWS };
+            self.sort_digit(to, digit, items, l.nth("scatter", number));
         }
         to.stage("tiles");
         self.count(to, WHOLE, COUNTS_ALL);
         if bands > 1 {
-            to.run_counted(l.get("count_tiles"), [0; 4], self.groups, args::ROWS);
+            to.run(l.get("count_tiles"), [0; 4], rows.div_ceil(256));
             to.run(l.get("cut_bands"), [0, bands, 0, 0], 1);
         }
         for band in 0..bands {
@@ -172,15 +190,16 @@ impl Passes<'_> {
     }
 
     /// Counts the entries of a band.
-    fn count(&self, to: &mut Recorder<'_>, band: u32, sum: u32) {
+    fn count(&self, to: &mut impl Record<L>, band: u32, sum: u32) {
         let l = self.launches;
-        to.run_counted(l.get("count_entries"), [band, 0, 0, 0], self.groups, args::ROWS);
-        to.run_counted(l.get("scan_blocks"), [sum, 0, 0, 0], self.groups, args::ROW_BLOCKS);
-        to.run(l.get("scan_sums"), [sum, self.shape.bands, 0, 0], 1);
+        let Shape { rows, bands, .. } = self.shape;
+        to.run(l.get("count_entries"), [band, 0, 0, 0], rows.div_ceil(256));
+        to.run(l.get("scan_blocks"), [sum, 0, 0, 0], rows.div_ceil(BLOCK as u32));
+        to.run(l.get("scan_sums"), [sum, bands, 0, 0], 1);
     }
 
     /// Builds the tile lists of a band. If there is only one, its entries are already counted.
-    fn lists(&self, to: &mut Recorder<'_>, band: u32, sum: u32) {
+    fn lists(&self, to: &mut impl Record<L>, band: u32, sum: u32) {
         let l = self.launches;
         to.stage("tiles");
         let several = self.shape.bands > 1;
@@ -192,30 +211,30 @@ impl Passes<'_> {
         let digits = self.shape.tile_digits();
         let is_odd = |number: u32| number as usize % 2;
         let emit = l.nth("emit_entries", is_odd(digits));
-        to.run_counted(emit, [tiles, 0, 0, 0], self.groups, args::ROWS);
+        to.run(emit, [tiles, 0, 0, 0], self.shape.rows.div_ceil(256));
         for digit in 0..digits {
             let [keys, values] = [is_odd(digit), is_odd(digits - digit)];
-            self.sort_digit(to, digit, 1, l.nth("scatter", 2 * keys + values));
+            self.sort_digit(to, digit, ENTRIES, l.nth("scatter", 2 * keys + values));
         }
         let groups = (self.shape.tiles + 1).div_ceil(256);
         to.run(l.nth("find_tiles", is_odd(digits)), [0; 4], groups);
     }
 
     /// Applies the photograph's exposure to a copy of the rendered image.
-    pub(super) fn expose(&self, to: &mut Recorder<'_>, pixels: u32) {
+    pub(super) fn expose(&self, to: &mut impl Record<L>, pixels: u32) {
         to.run(self.launches.get("expose"), [0; 4], groups(pixels.into()) as u32);
     }
 
     /// Backpropagates the gradients of an exposed image to the canvas, and sums the derivatives with respect to the
     /// exposure.
-    pub(super) fn expose_bwd(&self, to: &mut Recorder<'_>, pixels: u32) {
+    pub(super) fn expose_bwd(&self, to: &mut impl Record<L>, pixels: u32) {
         let l = self.launches;
         to.run(l.get("expose_bwd"), [0; 4], groups(pixels.into()) as u32);
         to.run(l.get("total_exposure"), [0; 4], 1);
     }
 
     /// Stage 4 of an image with or without an exposure. If `differentiates`, dL/dpixel replaces the image.
-    pub(super) fn loss(&self, to: &mut Recorder<'_>, is_exposed: bool, differentiates: bool) {
+    pub(super) fn loss(&self, to: &mut impl Record<L>, is_exposed: bool, differentiates: bool) {
         let l = self.launches;
         let image = usize::from(is_exposed);
         to.stage("loss");
@@ -225,11 +244,14 @@ impl Passes<'_> {
                 to.run(l.nth("pixel_gradient", image), [channel, 0, 0, 0], self.shape.tiles);
             }
         }
-        to.run(l.get("total"), [0; 4], 1);
+        // The last gradient includes the means over the image.
+        if !differentiates {
+            to.run(l.get("total"), [0; 4], 1);
+        }
     }
 
     /// Stage 5: sums the pixels' gradients per row.
-    pub(super) fn backward(&self, to: &mut Recorder<'_>) {
+    pub(super) fn backward(&self, to: &mut impl Record<L>) {
         let l = self.launches;
         let Shape { rows, tiles, bands } = self.shape;
         let groups = rows.div_ceil(256);
@@ -250,47 +272,47 @@ impl Passes<'_> {
     }
 
     /// Stage 6.
-    pub(super) fn differentiate(&self, to: &mut Recorder<'_>) {
+    pub(super) fn differentiate(&self, to: &mut impl Record<L>) {
         to.stage("project_bwd");
-        to.run(self.launches.get("project_bwd"), [0; 4], self.shape.rows.div_ceil(256));
+        let launch = self.launches.get("project_bwd");
+        to.run_counted(launch, [0; 4], args::STEP);
     }
 
     /// Stages 6 to 8. Colours step before the geometry, as their gradient depends on it. The weight in `mask` is
     /// already divided by the number of rows in training.
     pub(super) fn optimise(
         &self,
-        to: &mut Recorder<'_>,
+        to: &mut impl Record<L>,
         sh_degree: u8,
         signals: bool,
         mask: Option<MaskTerm>,
     ) {
         let l = self.launches;
-        let groups = self.shape.rows.div_ceil(256);
         self.differentiate(to);
         if signals {
-            to.run(l.get("accumulate"), [0; 4], groups);
+            to.run_counted(l.get("accumulate"), [0; 4], args::STEP);
         }
         if let Some(MaskTerm { start, rate, weight, threshold }) = mask {
             let immediates = [start, rate, weight, logit(threshold)].map(f32::to_bits);
-            to.run(l.get("step_masks"), immediates, groups);
+            to.run_counted(l.get("step_masks"), immediates, args::STEP);
         }
         to.stage("adam");
         for band in 0..=usize::from(sh_degree) {
             let [first, coefficients] = [(band * band) as u32, (2 * band + 1) as u32];
-            let pairs = self.shape.rows * (3 * coefficients).div_ceil(2);
             let immediates = [first, coefficients, 0, 0];
-            to.run(l.nth("adam_band", band), immediates, pairs.div_ceil(256));
+            let at = args::BANDS + 12 * band as u64;
+            to.run_counted(l.nth("adam_band", band), immediates, at);
         }
-        to.run(l.get("adam_geometry"), [0; 4], groups);
+        to.run_counted(l.get("adam_geometry"), [0; 4], args::STEP);
     }
 
     /// Writes the pixels with the largest errors to the range "worst": their number, then the error bits and the index
     /// of each, as many as fit. Pixels whose error equals that of the last one wanted are included.
-    pub(super) fn worst(&self, to: &mut Recorder<'_>, search: &Search) {
+    pub(super) fn worst(&self, to: &mut impl Record<L>, search: &Search) {
         let l = self.launches;
-        let &Search { pixels, wanted, room, min_alpha, of_gradient } = search;
-        let (groups, map) = (pixels.div_ceil(256), usize::from(of_gradient));
-        let immediates = |a, b| [a, b, min_alpha.to_bits(), u32::from(of_gradient)];
+        let &Search { pixels, wanted, room, min_alpha, error } = search;
+        let (groups, map) = (pixels.div_ceil(256), usize::from(error != ErrorPlace::Buffer));
+        let immediates = |a, b| [a, b, min_alpha.to_bits(), error as u32];
         to.run(l.get("narrow"), [0, wanted, 0, 0], 1);
         for shift in [24, 16, 8, 0] {
             to.run(l.nth("count_errors", map), immediates(shift, u32::from(shift == 24)), groups);
@@ -301,7 +323,7 @@ impl Passes<'_> {
     }
 
     /// Finds the surface points of the pixels whose indices are uploaded, from index `first` on.
-    pub(super) fn surface(&self, to: &mut Recorder<'_>, pixels: u32, mode: u32, first: u32) {
+    pub(super) fn surface(&self, to: &mut impl Record<L>, pixels: u32, mode: u32, first: u32) {
         for band in 0..self.shape.bands {
             if self.shape.bands > 1 {
                 self.lists(to, band, COUNTS_AGAIN);
@@ -312,7 +334,7 @@ impl Passes<'_> {
     }
 
     /// Computes the columns of an auxiliary view: for each row, sums over the pixels that it is blended into.
-    pub(super) fn columns(&self, to: &mut Recorder<'_>) {
+    pub(super) fn columns(&self, to: &mut impl Record<L>) {
         let l = self.launches;
         let groups = self.shape.rows.div_ceil(256);
         if !l.in_slots {
@@ -329,3 +351,6 @@ impl Passes<'_> {
         }
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -35,6 +35,10 @@ const GEOMETRY: usize = 12;
 /// Words per row of the geometry if all but the means take 16 bits.
 const NARROW_GEOMETRY: usize = 7;
 
+/// Numbers per splat, and the index of its depth; see `shaders/shared/splat.wgsl`.
+pub(super) const SPLAT: usize = 10;
+pub(super) const DEPTH: usize = 9;
+
 /// The content of an array.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Content {
@@ -233,9 +237,8 @@ pub(super) fn row_arrays(
     let others = [
         ("ages", 1, Content::Ages),
         ("signals", planes, Content::Signals),
-        ("splats", 12, Content::Projected),
-        ("footprints", 4, Content::Projected),
-        ("depths", 1, Content::Projected),
+        ("splats", SPLAT, Content::Projected),
+        ("footprints", 2, Content::Projected),
         ("order", 1, Content::Projected),
         ("slots of row", slots, Content::Projected),
         ("row sums", fields, Content::SplatGradients),

@@ -20,11 +20,14 @@ pub(super) const OPS_BYTES: u64 = 1 << 18;
 /// allocators have.
 pub(super) const ALLOCATOR_BLOCK: u64 = 4 << 20;
 /// Largest number of bytes that are on their way to the device at a time.
-pub(super) const UPLOAD_BYTES: u64 = 4 << 20;
+pub(super) const UPLOAD_BYTES: u64 = 1 << 20;
 /// Largest number of bytes read back at a time.
 pub(super) const READ_BYTES: u64 = 1 << 20;
-/// Items per workgroup of the prefix sums and sorts; see `shaders/tiles.wgsl`.
+/// Items per workgroup of the prefix sums, and of the sorts; see `shaders/tiles.wgsl`.
 pub(super) const BLOCK: u64 = 2048;
+pub(super) const SORTED: u64 = 1024;
+/// Number of values of a digit of the sorts.
+const DIGITS: u64 = 256;
 /// Largest number of (row, tile) pairs in the tile lists at a time; prefix sums saturate beyond it.
 pub(super) const MAX_ENTRIES: u64 = 1 << 28;
 
@@ -65,8 +68,8 @@ pub(super) struct Sizes {
     pub(super) counts_dominant: bool,
     /// True if rows have masks.
     pub(super) with_masks: bool,
-    /// True if the loss writes the error per pixel.
-    with_error: bool,
+    /// True if the loss writes an error per pixel for candidates besides the one for row scores.
+    pub(super) with_error: bool,
     /// True if pixels at edges have more weight.
     pub(super) with_edges: bool,
     /// True if photographs have exposures.
@@ -125,7 +128,8 @@ impl Sizes {
             counts_dominant: counts_dominant(needs),
             with_masks: needs.mask.is_some(),
             with_edges: records.has(Field::Error) && needs.error_score.edge > 0.0,
-            with_error: needs.candidates.is_some_and(|r| r.error != ErrorMode::Gradient),
+            with_error: records.has(Field::Error)
+                && needs.candidates.is_some_and(|r| r.error != ErrorMode::Gradient),
             exposures: false,
         }
     }
@@ -184,6 +188,18 @@ impl Sizes {
         arrays
     }
 
+    /// Bytes of the rows' sums.
+    fn row_sums_bytes(&self) -> u64 {
+        4 * self.records.stride() as u64 * self.budget.total as u64
+    }
+
+    /// The name of the buffer or range for the derivatives of the loss: they borrow the rows' sums, which are unused
+    /// before the backward pass, if these are large enough.
+    pub(super) fn derivatives(&self) -> &'static str {
+        let has_range = self.ranges().iter().any(|range| range.name == "derivatives");
+        if has_range { "derivatives" } else { "row sums" }
+    }
+
     /// The ranges of [`SCRATCH`]. Three uses follow each other in a step: sorting rows and entries, the loss, and the
     /// pixels with the largest errors.
     pub(super) fn ranges(&self) -> Vec<ScratchRange> {
@@ -198,7 +214,13 @@ impl Sizes {
             .map(|(i, name)| range("entries", name, i * numbers, 4 * self.cap))
             .collect();
         let (width, height) = self.image;
-        all.push(range("loss", "derivatives", 0, 12 * u64::from(width) * u64::from(height)));
+        // The entries of each row, or each digit's items in each block.
+        let sums = (self.budget.total as u64).max(DIGITS * self.cap.div_ceil(SORTED));
+        all.push(range("sums", "sums", 3 * numbers, 4 * sums));
+        let derivatives = 12 * u64::from(width) * u64::from(height);
+        if derivatives > self.row_sums_bytes() {
+            all.push(range("loss", "derivatives", 0, derivatives));
+        }
         // As long as the longest of the others, which a kernel can bind.
         let largest = all.iter().map(|range| range.bytes).max().unwrap_or(0);
         all.insert(0, range("loss", "worst", 0, largest));
@@ -226,9 +248,8 @@ impl Sizes {
             let bytes = 4 * self.records.stride() as u64 * cap;
             add(Section::Tiles, "gradients per entry", "records", bytes);
         }
-        let sums = (self.budget.total as u64).max(16 * cap.div_ceil(BLOCK));
-        add(Section::Tiles, "sums", "sums", 4 * sums);
-        add(Section::Tiles, "sums", "block sums", 4 * sums.div_ceil(BLOCK));
+        let blocks = (self.budget.total as u64).div_ceil(BLOCK).max(DIGITS);
+        add(Section::Tiles, "sums", "block sums", 4 * blocks);
         let (width, height) = self.image;
         let pixels = u64::from(width) * u64::from(height);
         let tiles = u64::from(grid(width, height)[1]);
@@ -272,7 +293,7 @@ impl Sizes {
         };
         let frame = size_of::<Frame>() as u64;
         add_as("small buffers", "frame", frame, BufferUsages::UNIFORM | BufferUsages::COPY_DST);
-        add_as("small buffers", "groups", 64, BufferUsages::STORAGE | BufferUsages::INDIRECT);
+        add_as("small buffers", "groups", 128, BufferUsages::STORAGE | BufferUsages::INDIRECT);
         let staging = BufferUsages::MAP_READ | BufferUsages::COPY_DST;
         add_as("copies to the host", "read", READ_BYTES, staging);
         all
@@ -358,7 +379,7 @@ mod tests {
         let cas = Accumulation::SubgroupCas;
         let found = [(4, Storage::default()), (4, both8), (1, smallest)]
             .map(|(pairs, storage)| bytes_per_row(pairs, storage, cas));
-        assert_eq!(found, [1018, 666, 518]);
+        assert_eq!(found, [985, 633, 477]);
         // Records, the rows of slots, and the slots of rows.
         let in_slots = bytes_per_row(4, Storage::default(), Accumulation::Slots);
         assert_eq!(in_slots - found[0], 4 * (40 + 4) + 8);

@@ -19,14 +19,13 @@ impl GpuBackend {
         let tiles = frame.image[3];
         loop {
             let shape = Shape { rows, tiles, bands: self.bands };
-            let groups = self.buffers.get("groups");
-            let passes = Passes { launches: &self.launches, groups, shape };
+            let passes = Passes { launches: &self.launches, shape };
             let mut encoder = self.device.device.create_command_encoder(&Default::default());
             if shape.bands > 1 {
                 encoder.clear_buffer(self.buffers.get("tile counts"), 0, None);
             }
             let pass = encoder.begin_compute_pass(&Default::default());
-            let mut to = Recorder::new(pass);
+            let mut to = Recorder::new(pass, self.buffers.get("groups"));
             to.stages.clock = self.device.clock.as_ref();
             encode(&passes, &mut to);
             let stages = to.end();
@@ -70,8 +69,7 @@ impl GpuBackend {
         shape: Shape,
         encode: impl FnOnce(&Passes<'_>, &mut Recorder<'_>),
     ) {
-        let groups = self.buffers.get("groups");
-        let passes = Passes { launches: &self.launches, groups, shape };
+        let passes = Passes { launches: &self.launches, shape };
         self.submit(|to| encode(&passes, to));
     }
 
@@ -79,7 +77,7 @@ impl GpuBackend {
     pub(super) fn submit(&self, encode: impl FnOnce(&mut Recorder<'_>)) {
         let mut encoder = self.device.device.create_command_encoder(&Default::default());
         let pass = encoder.begin_compute_pass(&Default::default());
-        encode(&mut Recorder::new(pass));
+        encode(&mut Recorder::new(pass, self.buffers.get("groups")));
         self.device.queue.submit([encoder.finish()]);
     }
 }

@@ -5,6 +5,7 @@ use std::ops::Range;
 use densify_policies::policy::Signal;
 
 use super::frame::target;
+use super::passes::Record;
 use super::rows::{Content, RowArray};
 use super::{GpuBackend, ResidentPhotograph, readback};
 use crate::signals::ParameterSignal;

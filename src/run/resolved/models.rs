@@ -10,6 +10,7 @@ use crate::models::{is_model, iteration_so_far, read_model};
 use crate::observer::Observer;
 use crate::spec::AbsolutePath;
 use densify_core::gaussians::{Gaussians, sh_coefficients};
+use densify_core::memory::Ledger;
 use densify_render::{MomentStorage, Setup, Storage};
 use densify_train::importance::needs;
 use densify_train::output::{CONFIG_FILE, model_path, saved_iterations};
@@ -84,13 +85,31 @@ pub(super) fn first_bytes(
     if model.rows <= case.budget(size.rows).trainable() {
         return reading;
     }
-    let setup = importance_setup(model.rows, case, size);
-    let backend = case.inputs.device.memory_plan(model.sh_degree, &setup, threads).on_host();
+    let backend = importance_ledger(model, case, size, threads).on_host();
     let [train, _] = case.inputs.images;
     let image = train.held(0) + train.decoding(1);
     // While importance is measured, the model and its copy in the backend exist; the rows that are then kept take less
     // than that copy.
     reading.max(bytes_of(model) + backend + image + densify_train::importance::bytes(model.rows))
+}
+
+/// The memory of the backend that measures the importance of a model.
+fn importance_ledger(model: ModelSize, case: &Case<'_>, size: &RunSize, threads: usize) -> Ledger {
+    let setup = importance_setup(model.rows, case, size);
+    case.inputs.device.memory_plan(model.sh_degree, &setup, threads)
+}
+
+/// Bytes on the device while the importance of the model of `--init` is measured; 0 if it is within the budget.
+pub(super) fn first_bytes_on_device(
+    model: ModelSize,
+    case: &Case<'_>,
+    size: &RunSize,
+    threads: usize,
+) -> u64 {
+    if model.rows <= case.budget(size.rows).trainable() {
+        return 0;
+    }
+    importance_ledger(model, case, size, threads).on_device()
 }
 
 /// The setup of the backend that measures the importance of this many rows.

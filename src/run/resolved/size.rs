@@ -14,19 +14,17 @@ use densify_core::memory::{Bytes, Ledger};
 use densify_core::numbers::grouped;
 use densify_core::spelling::Spelling;
 use densify_data::dataset::Resolution;
-use densify_render::BackendKind;
+use densify_render::{BackendKind, TILE};
 
 /// Default of `--budget`: a model of this size trains on a laptop in well under 2 GiB, and is enough for a room or an
 /// object; large outdoor scenes need more.
 pub const DEFAULT_BUDGET: usize = 200_000;
-/// Side of a tile `[px]`.
-const TILE: u32 = 16;
 /// Memory for decoded photographs without `--image-cache` `[bytes]`.
 const DEFAULT_IMAGE_CACHE: u64 = 1 << 30;
 /// (Row, tile) pairs per row of the budget without `--memory`.
 const PAIRS_PER_ROW: usize = 16;
-/// On a GPU without `--memory`, lists with more than [`PAIRS`]`[0]` pairs per row have at most this many pairs per tile of
-/// the largest image, or [`PAIRS_OF_SMALL_IMAGE`]. Few views exceed that, and those are rendered in bands.
+/// On a GPU, lists with more than [`PAIRS`]`[0]` pairs per row have at most this many pairs per tile of the largest image,
+/// or [`PAIRS_OF_SMALL_IMAGE`]. Few views exceed that, and those are rendered in bands.
 const PAIRS_PER_TILE: usize = 512;
 const PAIRS_OF_SMALL_IMAGE: usize = 1 << 20;
 /// Minimum number of trained rows of a useful model, unless the user asks for fewer.
@@ -148,14 +146,16 @@ impl Case<'_> {
 
     /// Maximum number of (row, tile) pairs of this many rows without options about it.
     fn default_pairs(&self, rows: usize) -> usize {
-        let pairs = rows.saturating_mul(PAIRS_PER_ROW);
-        if self.inputs.device.kind() == BackendKind::Cpu {
-            return pairs;
+        let enough = self.enough_pairs().max(rows.saturating_mul(PAIRS[0]));
+        rows.saturating_mul(PAIRS_PER_ROW).min(enough)
+    }
+
+    /// Number of (row, tile) pairs that few views exceed.
+    fn enough_pairs(&self) -> usize {
+        match self.inputs.device.kind() {
+            BackendKind::Cpu => usize::MAX,
+            BackendKind::Gpu => pairs_of_image(self.inputs.dataset.largest_image()),
         }
-        let (width, height) = self.inputs.dataset.largest_image();
-        let tiles = width.div_ceil(TILE) as usize * height.div_ceil(TILE) as usize;
-        let by_tiles = tiles.saturating_mul(PAIRS_PER_TILE).max(PAIRS_OF_SMALL_IMAGE);
-        pairs.min(rows.saturating_mul(PAIRS[0]).max(by_tiles))
     }
 
     /// The limit that the user set on the number of rows, if any.
@@ -303,6 +303,10 @@ fn request(case: &Case<'_>, memory: u64) -> Result<SizeRequest, Failure> {
         tile_cap: case.tile_cap(),
         pairs: case.choices.knobs.pairs_per_row.map_or(PAIRS, |pairs| [pairs; 3]),
         max_pairs: max_pairs(case, case.min_rows())?,
+        enough_pairs: match case.choices.knobs.pairs_per_row {
+            Some(_) => usize::MAX,
+            None => case.enough_pairs(),
+        },
         // On a GPU the image cache is in host memory, which `--memory` does not limit.
         image_cache: match case.inputs.device.kind() {
             BackendKind::Gpu => Some(case.image_cache().unwrap_or(DEFAULT_IMAGE_CACHE)),
@@ -311,6 +315,12 @@ fn request(case: &Case<'_>, memory: u64) -> Result<SizeRequest, Failure> {
         max_image_bytes: DEFAULT_IMAGE_CACHE,
         all_image_bytes: case.all_image_bytes(),
     })
+}
+
+/// Number of (row, tile) pairs that few views of this size `[px]` exceed.
+fn pairs_of_image((width, height): (u32, u32)) -> usize {
+    let tiles = width.div_ceil(TILE) as usize * height.div_ceil(TILE) as usize;
+    tiles.saturating_mul(PAIRS_PER_TILE).max(PAIRS_OF_SMALL_IMAGE)
 }
 
 /// Maximum number of (row, tile) pairs that the backend supports at a time.
@@ -335,4 +345,15 @@ fn no_size_error(case: &Case<'_>, request: &SizeRequest) -> Result<Failure, Fail
     let needed = needed / MIB;
     fixes.push(vec![Remedy::Memory(needed)]);
     Ok(SizeProblem::NoModelFits { memory, rows, sh_degree: degree, needed, remedies: fixes }.into())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn lists_grow_with_the_image_but_not_below_those_of_a_small_one() {
+        assert_eq!(pairs_of_image((1600, 1000)), 100 * 63 * 512);
+        assert_eq!(pairs_of_image((17, 16)), PAIRS_OF_SMALL_IMAGE);
+    }
 }

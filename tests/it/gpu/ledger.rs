@@ -51,9 +51,9 @@ fn device_allocations_match_the_ledger() {
         let mut gpu = GpuBackend::new(&model, &options, device).expect("a small model fits");
         let promised = gpu.planned_bytes();
         assert_eq!(gpu.allocated_bytes(), promised);
-        // Beyond the buffers: uploads of 4 MiB, which with 1 MiB of copies to the host may leave as much of their blocks
+        // Beyond the buffers: uploads of 1 MiB, which with 1 MiB of copies to the host may leave as much of their blocks
         // unused, and three blocks of 4 MiB.
-        assert_eq!(gpu.ledger().on_device(), promised + ((4 + 5 + 12) << 20));
+        assert_eq!(gpu.ledger().on_device(), promised + ((1 + 2 + 12) << 20));
         let has_host_parts = needs.aux.is_some() || needs.error_score.edge > 0.0;
         assert_eq!(gpu.ledger().on_host() > 0, has_host_parts, "{needs:?}");
         assert_eq!(&device.memory_plan(model.sh_degree, &options), gpu.ledger());

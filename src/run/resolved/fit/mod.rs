@@ -41,6 +41,8 @@ pub(super) struct SizeRequest {
     pub(crate) pairs: [usize; 3],
     /// Maximum number of (row, tile) pairs that the device supports.
     pub(crate) max_pairs: usize,
+    /// Number of (row, tile) pairs that few views exceed: lists with more than the first of `pairs` per row are no longer.
+    pub(crate) enough_pairs: usize,
     /// Bytes of decoded images; `None`: chosen by the solver.
     pub(crate) image_cache: Option<u64>,
     /// Maximum bytes of decoded images that are kept at the expense of rows.
@@ -70,7 +72,9 @@ impl SizeRequest {
     /// A size with this many pairs per row, and at most 1 / [`IMAGE_SHARE_DIVISOR`] of the memory for images.
     pub(super) fn size(&self, rows: usize, sh_degree: u8, pairs: usize) -> RunSize {
         let max_pairs = self.max_pairs.max(rows);
-        let tile_cap = self.tile_cap.unwrap_or_else(|| rows.saturating_mul(pairs).min(max_pairs));
+        let enough = self.enough_pairs.max(rows.saturating_mul(self.pairs[0]));
+        let chosen = || rows.saturating_mul(pairs).min(enough).min(max_pairs);
+        let tile_cap = self.tile_cap.unwrap_or_else(chosen);
         let share = self.memory / IMAGE_SHARE_DIVISOR;
         let images = || self.all_image_bytes.min(share).min(self.max_image_bytes);
         let image_cache = self.image_cache.unwrap_or_else(images);

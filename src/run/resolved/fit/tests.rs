@@ -54,6 +54,7 @@ fn request(run: &ImaginaryRun, memory: u64) -> SizeRequest {
         tile_cap: None,
         pairs: PAIRS,
         max_pairs: u32::MAX as usize,
+        enough_pairs: usize::MAX,
         image_cache: None,
         max_image_bytes: 1 << 30,
         all_image_bytes: run.all_image_bytes,
@@ -174,4 +175,21 @@ fn a_degree_is_lowered_only_if_the_initial_rows_do_not_fit() {
         assert_eq!((size.sh_degree, size.rows), (degree, rows), "{memory}");
     }
     assert_eq!(run.fit(&request(&run, 1_008 * 136 - 1)), None);
+}
+
+#[test]
+fn lists_are_no_longer_than_views_need() {
+    let run = ImaginaryRun {
+        fixed: 0,
+        per_row: 0,
+        per_coefficient: 0,
+        per_pair: 0,
+        largest_image: 0,
+        all_image_bytes: 0,
+    };
+    let request = SizeRequest { enough_pairs: 100_000, ..request(&run, 0) };
+    let caps = |rows| PAIRS.map(|pairs| request.size(rows, 0, pairs).tile_cap);
+    assert_eq!(caps(1_000), [4_000, 8_000, 16_000]);
+    assert_eq!(caps(10_000), [40_000, 80_000, 100_000]);
+    assert_eq!(caps(50_000), [200_000; 3]);
 }
