@@ -154,10 +154,13 @@ impl Frame {
         Some(Seen { depth: 1.0 / mix(above, below, t), cosine })
     }
 
-    /// The interpolated colour at a position inside the image `[px]`, in 0..=255.
+    /// The colour at a position inside the image `[px]`, in 0..=255, interpolated unless there is background beside it.
     pub(super) fn colour_at(&self, u: f32, v: f32) -> [f32; 3] {
-        let DepthFrame { width, height, ref rgb, .. } = self.map;
-        let (corners, (s, t)) = neighbours(u, v, width, height);
+        let DepthFrame { width, height, ref depth, ref rgb } = self.map;
+        let (mut corners, (s, t)) = neighbours(u, v, width, height);
+        if corners.iter().any(|&corner| depth[corner] <= 0.0) {
+            corners = [v as usize * width + u as usize; 4];
+        }
         let mix = |a: f32, b: f32, share: f32| a + (b - a) * share;
         std::array::from_fn(|c| {
             let corner = |i: usize| f32::from(rgb[corners[i]][c]);
