@@ -69,7 +69,7 @@ pub(super) struct MeshArgs {
     #[arg(long, value_name = "KIND", default_value_t = DepthKind::default())]
     depth_kind: DepthKind,
     /// Ignore pixels whose Gaussians' depths have a standard deviation above this fraction of the depth
-    #[arg(long, value_name = "FRACTION", default_value_t = 0.1, value_parser = not_negative)]
+    #[arg(long, value_name = "FRACTION", default_value_t = 0.4, value_parser = not_negative)]
     max_spread: f64,
     /// Drop connected parts with less than this fraction of the mesh's area
     #[arg(long, value_name = "FRACTION", default_value_t = 0.001, value_parser = not_negative)]

@@ -7,6 +7,7 @@
 use std::path::Path;
 
 use densify::data::dataset::{Dataset, LoadOptions, formats as dataset_formats};
+use densify::data::meshes;
 use densify::data::models::{formats as model_formats, read_model};
 use densify::data::points::read_points;
 use densify::render::Setup;
@@ -46,7 +47,7 @@ pub fn targets() -> Vec<Target> {
         photographs: &["images/0.png", "images/1.png"],
         accepts: |folder, _| accepts_dataset(folder),
     });
-    let others: [Other; 8] = [
+    let others: [Other; 9] = [
         ("archive", "scan.zip", |_, file| accepts_dataset(file)),
         ("checkpoint", "step.safetensors", |_, file| accepts_checkpoint(file)),
         ("config", "config.toml", |folder, _| accepts_config(folder)),
@@ -54,6 +55,7 @@ pub fn targets() -> Vec<Target> {
         ("mesh-glb", "mesh.glb", |_, file| accepts_mesh(file)),
         ("mesh-gltf", "mesh.gltf", |_, file| accepts_mesh(file)),
         ("mesh-obj", "mesh.obj", |_, file| accepts_mesh(file)),
+        ("mesh-ply", "mesh.ply", |_, file| accepts_mesh_to_measure(file)),
         ("points", "points.ply", |_, file| accepts_points(file)),
     ];
     let others = others.map(|(name, file, accepts)| Target {
@@ -174,4 +176,14 @@ fn accepts_mesh(path: &Path) -> bool {
     let Ok(scene) = Scene::prepare(&Source::File(path.to_owned()), &options) else { return false };
     assert!(scene.render(0).depth.iter().all(|z| z.is_finite()));
     true
+}
+
+/// Reads a mesh as `densify eval` does.
+fn accepts_mesh_to_measure(path: &Path) -> bool {
+    meshes::is_mesh(path)
+        && meshes::read(path).is_ok_and(|mesh| {
+            let corners = || mesh.triangles.iter().flatten();
+            assert!(corners().all(|&corner| mesh.positions[corner as usize].is_finite()));
+            !mesh.triangles.is_empty()
+        })
 }

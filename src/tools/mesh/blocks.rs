@@ -120,7 +120,7 @@ pub(super) fn collect(
         let per_row = rows.map(|y| {
             let mut found = Vec::new();
             for x in 0..width {
-                if frame.weight[y * width + x] <= 0.0 {
+                if frame.cosine[y * width + x] <= 0.0 {
                     continue;
                 }
                 // Pixels are left out where they are much denser than voxels.

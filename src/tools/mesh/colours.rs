@@ -27,11 +27,11 @@ pub(super) fn paint(
     frames.for_each(|frame| {
         let view = View::new(frame, grid);
         sums.par_iter_mut().zip(&mesh.positions).for_each(|(sum, &position)| {
-            let Some(([u, v], z, depth, weight)) = view.look_at(Vec3::from(position)) else {
+            let Some(([u, v], distance, seen)) = view.look_at(Vec3::from(position)) else {
                 return;
             };
-            let is_shown = (depth - z).abs() < truncation;
-            let weight = if is_shown { weight } else { HIDDEN * weight };
+            let is_shown = distance.abs() < truncation;
+            let weight = if is_shown { seen.weight() } else { HIDDEN * seen.weight() };
             for (sum, value) in sum.iter_mut().zip(frame.colour_at(u, v)) {
                 *sum += weight * value;
             }

@@ -5,8 +5,9 @@ use glam::DVec3;
 use super::MeshError;
 use super::frame::{Frame, Frames};
 
-/// Number of points taken from a view, about.
+/// Number of points taken from a view and from all views, about.
 const POINTS: usize = 2000;
+const ALL_POINTS: usize = 200_000;
 /// Share of the points below the lower and above the upper side of the scene's box, along each axis: few points far
 /// outside, such as the sky's, do not count.
 const OUTSIDE: f64 = 0.01;
@@ -39,9 +40,10 @@ pub(super) struct Extent {
 /// Measures the scene: the box of the points seen, or the given region.
 pub(super) fn survey(frames: &mut Frames<'_>, region: Option<Region>) -> Result<Extent, MeshError> {
     let mut points = Vec::new();
+    let per_view = POINTS.min(ALL_POINTS / frames.count().max(1)).max(1);
     frames.for_each(|frame: &Frame| {
         let (width, height) = (frame.map.width, frame.map.height);
-        let step = ((width * height / POINTS) as f64).sqrt().max(1.0) as usize;
+        let step = ((width * height / per_view) as f64).sqrt().max(1.0) as usize;
         for y in (step / 2..height).step_by(step) {
             for x in (step / 2..width).step_by(step) {
                 points.extend(frame.seen_in_scene(x, y));

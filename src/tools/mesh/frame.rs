@@ -24,9 +24,25 @@ pub struct DepthFrame {
 pub(super) struct Frame {
     pub(super) camera: Camera,
     pub(super) map: DepthFrame,
-    /// cosθ/z², θ the angle between the ray and the surface's normal; 0 where the depth is unknown. Shape:
+    /// cosθ, θ the angle between the ray and the surface's normal; 0 where the depth is unknown. Shape:
     /// `[height, width]`.
-    pub(super) weight: Vec<f32>,
+    pub(super) cosine: Vec<f32>,
+}
+
+/// What a view shows at an image position.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Seen {
+    /// Camera-space z of the surface `[scene units]`.
+    pub(super) depth: f32,
+    /// See [`Frame::cosine`].
+    pub(super) cosine: f32,
+}
+
+impl Seen {
+    /// Weight of the observation, cosθ/z².
+    pub(super) fn weight(self) -> f32 {
+        self.cosine / (self.depth * self.depth)
+    }
 }
 
 /// The depth maps of a source. Those that fit into the memory are kept; the others are rendered again when needed.
@@ -58,7 +74,7 @@ impl<'a> Frames<'a> {
             }
             let frame = Frame::new(self.source.camera(view), self.source.frame(view)?);
             visit(&frame)?;
-            let bytes = (frame.weight.len() * (2 * size_of::<f32>() + 3)) as u64;
+            let bytes = (frame.cosine.len() * (2 * size_of::<f32>() + 3)) as u64;
             if let Some(left) = self.left.checked_sub(bytes) {
                 self.left = left;
                 self.kept[view] = Some(frame);
@@ -71,9 +87,9 @@ impl<'a> Frames<'a> {
 impl Frame {
     fn new(camera: Camera, map: DepthFrame) -> Self {
         let (width, height) = (map.width, map.height);
-        let mut frame = Self { camera, map, weight: Vec::new() };
-        let weights = (0..width * height).into_par_iter();
-        frame.weight = weights.map(|at| frame.confidence(at % width, at / width)).collect();
+        let mut frame = Self { camera, map, cosine: Vec::new() };
+        let pixels = (0..width * height).into_par_iter();
+        frame.cosine = pixels.map(|at| frame.cosine_at(at % width, at / width)).collect();
         frame
     }
 
@@ -95,8 +111,8 @@ impl Frame {
         self.seen(x, y).map(|p| rotation.transpose() * (p - translation))
     }
 
-    /// cosθ/z²; the normal comes from differences to the pixels beside, above and below.
-    fn confidence(&self, x: usize, y: usize) -> f32 {
+    /// cosθ; the normal comes from differences to the pixels beside, above and below.
+    fn cosine_at(&self, x: usize, y: usize) -> f32 {
         let Some(here) = self.seen(x, y) else { return 0.0 };
         let DepthFrame { width, height, .. } = self.map;
         let right = (x + 1 < width).then(|| self.seen(x + 1, y)).flatten();
@@ -108,20 +124,19 @@ impl Frame {
         let normal = along_x.cross(along_y);
         let cosine = normal.dot(here).abs() / (normal.length() * here.length());
         // A pixel without neighbours has no normal.
-        let weight = cosine / (here.z * here.z);
-        if weight.is_finite() { weight as f32 } else { 0.0 }
+        if cosine.is_finite() { cosine as f32 } else { 0.0 }
     }
 
-    /// Depth and confidence at an image position `[px]`; `None` outside of the image or where they are unknown. The
-    /// inverse depth is interpolated, exactly on planes, unless the four depths differ by more than `reach`.
-    pub(super) fn depth_at(&self, u: f32, v: f32, reach: f32) -> Option<(f32, f32)> {
+    /// The surface at an image position `[px]`; `None` outside of the image or where it is unknown. The inverse depth is
+    /// interpolated, exactly on planes, unless the four depths differ by more than `reach`.
+    pub(super) fn surface_at(&self, u: f32, v: f32, reach: f32) -> Option<Seen> {
         let DepthFrame { width, height, ref depth, .. } = self.map;
         if !(u >= 0.0 && v >= 0.0 && u < width as f32 && v < height as f32) {
             return None;
         }
         let nearest = v as usize * width + u as usize;
-        let (z, weight) = (depth[nearest], self.weight[nearest]);
-        if weight <= 0.0 {
+        let cosine = self.cosine[nearest];
+        if cosine <= 0.0 {
             return None;
         }
         let (corners, (s, t)) = neighbours(u, v, width, height);
@@ -131,18 +146,21 @@ impl Frame {
             (low, high) = (low.min(corner(i)), high.max(corner(i)));
         }
         if low <= 0.0 || high - low > reach {
-            return Some((z, weight));
+            return Some(Seen { depth: depth[nearest], cosine });
         }
         let mix = |a: f32, b: f32, share: f32| a + (b - a) * share;
         let above = mix(1.0 / corner(0), 1.0 / corner(1), s);
         let below = mix(1.0 / corner(2), 1.0 / corner(3), s);
-        Some((1.0 / mix(above, below, t), weight))
+        Some(Seen { depth: 1.0 / mix(above, below, t), cosine })
     }
 
-    /// The interpolated colour at a position inside the image `[px]`, in 0..=255.
+    /// The colour at a position inside the image `[px]`, in 0..=255, interpolated unless there is background beside it.
     pub(super) fn colour_at(&self, u: f32, v: f32) -> [f32; 3] {
-        let DepthFrame { width, height, ref rgb, .. } = self.map;
-        let (corners, (s, t)) = neighbours(u, v, width, height);
+        let DepthFrame { width, height, ref depth, ref rgb } = self.map;
+        let (mut corners, (s, t)) = neighbours(u, v, width, height);
+        if corners.iter().any(|&corner| depth[corner] <= 0.0) {
+            corners = [v as usize * width + u as usize; 4];
+        }
         let mix = |a: f32, b: f32, share: f32| a + (b - a) * share;
         std::array::from_fn(|c| {
             let corner = |i: usize| f32::from(rgb[corners[i]][c]);

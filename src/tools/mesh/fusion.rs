@@ -8,7 +8,7 @@ use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 
 use super::blocks::{Grid, KEY_BYTES, Key, SIDE, VOLUME, add, block, corner, key};
-use super::frame::{Frame, Frames};
+use super::frame::{Frame, Frames, Seen};
 use super::nets::{self, BlockNet, SAMPLE_BYTES};
 use super::{Limits, MeshError, TRUNCATION};
 
@@ -130,20 +130,23 @@ impl<'a> View<'a> {
         self.low + x * position.x + y * position.y + z * position.z
     }
 
-    /// Image position `[px]`, depth, and the depth and confidence of the surface there; `None` where it is unknown.
-    pub(super) fn look(&self, place: Vec3) -> Option<([f32; 2], f32, f32, f32)> {
+    /// Image position of a point in camera coordinates `[px]`, its signed distance from the surface seen there `[scene
+    /// units]`, positive in front of it, and this surface; `None` where it is unknown.
+    fn look(&self, place: Vec3) -> Option<([f32; 2], f32, Seen)> {
         if place.z <= 0.0 {
             return None;
         }
         let inverse = 1.0 / place.z;
         let u = self.focal[0] * place.x * inverse + self.principal[0];
         let v = self.focal[1] * place.y * inverse + self.principal[1];
-        let (depth, weight) = self.frame.depth_at(u, v, self.truncation)?;
-        Some(([u, v], place.z, depth, weight))
+        let seen = self.frame.surface_at(u, v, self.truncation)?;
+        // Along the optical axis. Distances along the normal, for which θ is known, gave worse surfaces: normals of
+        // rendered depth are uncertain where rays graze a surface.
+        Some(([u, v], seen.depth - place.z, seen))
     }
 
-    /// Looks at a position `[voxels]`.
-    pub(super) fn look_at(&self, position: Vec3) -> Option<([f32; 2], f32, f32, f32)> {
+    /// As [`look`](Self::look), from a position `[voxels]`.
+    pub(super) fn look_at(&self, position: Vec3) -> Option<([f32; 2], f32, Seen)> {
         self.look(self.place(position.as_dvec3()).as_vec3())
     }
 
@@ -172,11 +175,12 @@ impl<'a> View<'a> {
             let (y, z) = ((row % SIDE) as f32, (row / SIDE) as f32);
             let start = origin + along_y * y + along_z * z;
             for (x, voxel) in voxels.iter_mut().enumerate() {
-                let Some((_, z, depth, weight)) = self.look(start + along_x * x as f32) else {
+                let Some((_, distance, seen)) = self.look(start + along_x * x as f32) else {
                     continue;
                 };
-                let distance = (depth - z) / self.truncation;
+                let distance = distance / self.truncation;
                 if distance >= -1.0 {
+                    let weight = seen.weight();
                     voxel.weight += weight;
                     let share = weight / voxel.weight;
                     voxel.distance += (distance.min(1.0) - voxel.distance) * share;

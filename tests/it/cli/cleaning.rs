@@ -35,7 +35,8 @@ fn floaters_go_and_the_model_stays() {
     let stdout = outcome.ok().stdout;
     let kept = gaussians(&cleaned).len();
     assert!(kept <= rows && kept > rows / 2, "{kept} of {rows}: {stdout}");
-    for word in ["round 1", "in no training view", "0.000 % of the weight", "test views", "cleaned"] {
+    for word in ["round 1", "in no training view", "0.000 % of the weight", "test views", "cleaned"]
+    {
         assert!(stdout.contains(word), "{word} is not in {stdout}");
     }
     // What no view shows does not change a picture.
@@ -48,8 +49,7 @@ fn floaters_go_and_the_model_stays() {
     assert!(refined > 0 && refined < rows, "{refined} of {rows}: {stdout}");
     assert!(stdout.contains("in front of the surface"), "{stdout}");
     // Neither the number of threads nor a repetition changes the file.
-    let (outcome, again) =
-        clean(&run, "c.ply", "--rounds 9 --refine 10 --backend cpu --threads 1");
+    let (outcome, again) = clean(&run, "c.ply", "--rounds 9 --refine 10 --backend cpu --threads 1");
     outcome.ok();
     assert!(read(&again) == read(&cleaned));
     assert!(read(&model) == original);
