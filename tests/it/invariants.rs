@@ -198,7 +198,17 @@ const MODULES: [(&str, &[&str]); 5] = [
     ),
     (
         "src/data",
-        &["error", "picture_file", "ply", "models", "points", "dataset", "track_colours", "views"],
+        &[
+            "error",
+            "picture_file",
+            "ply",
+            "models",
+            "points",
+            "las",
+            "dataset",
+            "track_colours",
+            "views",
+        ],
     ),
     (
         "src/render",

@@ -10,6 +10,7 @@ mod camera_paths;
 mod comparing;
 mod compressing;
 mod configuring;
+mod depth_maps;
 mod exporting;
 mod exposing;
 mod faults;
