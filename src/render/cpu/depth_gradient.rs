@@ -20,9 +20,12 @@ use pulp::{Simd, WithSimd};
 use rayon::prelude::*;
 
 use super::CpuBackend;
-use super::rasterize::{DEPTH, DepthPlane, TRANSMITTANCE, TileCanvas, TilePlace, ZERO_PLANE};
+use super::rasterize::{
+    DEPTH, DepthPlane, Plane, TRANSMITTANCE, TileCanvas, TilePlace, ZERO_PLANE, set_row_of_plane,
+};
 use super::rasterize_bwd::{BY_DEPTH, TileGradient};
-use super::tiles::Grid;
+use super::simd::{SIGN, WIDTH};
+use super::tiles::{Grid, TILE};
 use crate::StepInput;
 use crate::depth::{DepthLoss, DepthTerm, confidence_in};
 use crate::signals::Field;
@@ -40,20 +43,22 @@ const PIXELS_PER_TASK: usize = 1 << 16;
 pub(super) struct DepthChannel {
     /// True if x is 1/z, false if it is z.
     is_inverse: bool,
-    /// ρ(x) is x where x >= 0, and `sign`·x elsewhere.
-    pub(super) sign: f32,
+    /// True if the channel has squares.
+    pub(super) has_squares: bool,
+    /// The sign bit if ρ is the absolute value, 0 if it is the identity.
+    pub(super) sign_bit: u32,
 }
 
 impl DepthChannel {
     /// Depth itself.
-    pub(super) const DEPTH: Self = Self { is_inverse: false, sign: 1.0 };
+    pub(super) const DEPTH: Self = Self { is_inverse: false, has_squares: false, sign_bit: 0 };
 
-    pub(super) const fn of_loss(term: DepthTerm) -> Self {
-        let sign = match term {
-            DepthTerm::Expected => 1.0,
-            DepthTerm::Samples => -1.0,
+    pub(super) fn of_loss(loss: &DepthLoss<'_>) -> Self {
+        let sign_bit = match loss.term {
+            DepthTerm::Expected => 0,
+            DepthTerm::Samples => SIGN,
         };
-        Self { is_inverse: true, sign }
+        Self { is_inverse: true, has_squares: loss.distortion > 0.0, sign_bit }
     }
 
     /// x of a splat.
@@ -125,26 +130,57 @@ impl WithSimd for DepthGradient<'_> {
     /// The value of the depth term in these pixels.
     type Output = f64;
 
+    /// Scalar loops, which the compiler vectorises for the dispatched instruction set.
     #[inline(always)]
     fn with_simd<S: Simd>(self, _: S) -> f64 {
         let Self { grid, first, loss, canvas, gradient } = self;
         let mut total = 0.0;
         for (number, (canvas, gradient)) in (first..).zip(canvas.iter_mut().zip(gradient)) {
-            let sums = std::mem::replace(&mut canvas.planes[DEPTH], ZERO_PLANE);
-            let planes = &mut canvas.planes;
-            (planes[SQUARE], planes[BY_ALPHA]) = (ZERO_PLANE, ZERO_PLANE);
-            let by_depth = &mut gradient.planes[BY_DEPTH];
-            *by_depth = ZERO_PLANE;
-            TilePlace::new(grid, number).for_each_pixel(grid.width, |patch, lane, pixel| {
-                let transmittance = planes[TRANSMITTANCE][patch][lane];
-                let found = loss.at_pixel(pixel, transmittance, sums[patch][lane]);
-                planes[CENTRE][patch][lane] = found.centre;
-                planes[SQUARE][patch][lane] = found.square;
-                planes[BY_ALPHA][patch][lane] = found.by_alpha;
-                by_depth[patch][lane] = found.by_depth;
-                total += f64::from(found.value);
-            });
+            let given = GivenTile::new(&loss, &TilePlace::new(grid, number));
+            let mut values = [0.0; WIDTH];
+            for (p, by_depth) in gradient.planes[BY_DEPTH].iter_mut().enumerate() {
+                for lane in 0..WIDTH {
+                    let [inverse, confidence] = [given.inverse[p][lane], given.confidence[p][lane]];
+                    let transmittance = canvas.planes[TRANSMITTANCE][p][lane];
+                    let sum = canvas.planes[DEPTH][p][lane];
+                    let mask = given.mask[p][lane];
+                    let found = loss.at_pixel([inverse, confidence, mask], transmittance, sum);
+                    values[lane] += found.value;
+                    by_depth[lane] = found.by_depth;
+                    canvas.planes[CENTRE][p][lane] = found.centre;
+                    canvas.planes[SQUARE][p][lane] = found.square;
+                    canvas.planes[BY_ALPHA][p][lane] = found.by_alpha;
+                }
+            }
+            total += values.iter().map(|&value| f64::from(value)).sum::<f64>();
         }
         total
+    }
+}
+
+/// The given depth in a tile's pixels; 0 outside the image.
+pub(super) struct GivenTile {
+    /// The given inverse depth; 0 where none is given `[1/scene units]`.
+    pub(super) inverse: Plane,
+    /// Confidence times mask.
+    confidence: Plane,
+    mask: Plane,
+}
+
+impl GivenTile {
+    #[inline(always)]
+    pub(super) fn new(loss: &DepthLoss<'_>, place: &TilePlace) -> Self {
+        let mut given = Self { inverse: ZERO_PLANE, confidence: ZERO_PLANE, mask: ZERO_PLANE };
+        for y in 0..place.height {
+            let first = (place.y as usize + y) * loss.width + place.x as usize;
+            let [mut inverse, mut confidence, mut mask] = [[0.0; TILE]; 3];
+            for x in 0..place.width {
+                [inverse[x], confidence[x], mask[x]] = loss.given(first + x);
+            }
+            set_row_of_plane(&mut given.inverse, y, &inverse);
+            set_row_of_plane(&mut given.confidence, y, &confidence);
+            set_row_of_plane(&mut given.mask, y, &mask);
+        }
+        given
     }
 }

@@ -237,7 +237,7 @@ impl CpuBackend {
         let (mut layout, mut channel) = (self.signals.layout(), DepthChannel::DEPTH);
         let mut depth_value = None;
         if let Some(depth) = depth {
-            channel = DepthChannel::of_loss(depth.term);
+            channel = DepthChannel::of_loss(&depth);
             depth_value = self.depth_gradient(&frame.grid, depth);
         } else {
             layout = layout.without_depth();

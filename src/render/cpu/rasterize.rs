@@ -15,6 +15,7 @@ use std::sync::atomic::{AtomicU32, AtomicU64, Ordering::Relaxed};
 use pulp::{Simd, WithSimd};
 
 use super::batch::{BATCH, Batch};
+use super::depth_gradient::GivenTile;
 use super::project::Splat;
 use super::simd::{V, WIDTH, exp2_of, load_of, store_of};
 use super::tiles::{Entry, Grid, TILE};
@@ -58,14 +59,10 @@ pub(super) enum DepthPlane<'a> {
 impl DepthPlane<'_> {
     /// The inverse depth given in each pixel of a tile, from which distances are taken; 0 where there is none.
     fn given(self, place: &TilePlace) -> Plane {
-        let mut plane = ZERO_PLANE;
-        if let Self::Distance(loss) = self {
-            place.for_each_pixel(loss.width, |patch, lane, pixel| {
-                let [inverse, confidence] = loss.given(pixel);
-                plane[patch][lane] = if confidence > 0.0 { inverse } else { 0.0 };
-            });
+        match self {
+            Self::Distance(loss) => GivenTile::new(&loss, place).inverse,
+            _ => ZERO_PLANE,
         }
-        plane
     }
 }
 
@@ -202,29 +199,41 @@ impl WithSimd for Rasterize<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, s: S) {
-        // Halves or quarters of a patch are processed in pairs, so that common values are loaded once. Depth and
-        // dominant pixels, which are rarely needed, share one kernel.
-        let is_unused = matches!(self.depth_plane, DepthPlane::Unused);
-        let with_extras = !is_unused || !self.dominant.is_empty();
-        match (with_extras, matches!(S::F32_LANES, 4 | 8)) {
-            (true, true) => self.blend::<S, true, 2>(s),
-            (true, false) => self.blend::<S, true, 1>(s),
-            (false, true) => self.blend::<S, false, 2>(s),
-            (false, false) => self.blend::<S, false, 1>(s),
+        // Halves or quarters of a patch are processed in pairs, so that common values are loaded once.
+        if const { matches!(S::F32_LANES, 4 | 8) } {
+            self.blend_by::<S, 2>(s);
+        } else {
+            self.blend_by::<S, 1>(s);
         }
     }
 }
 
+/// What [`Rasterize::blend`] accumulates besides colour. Dominant pixels, which are rarely needed, come with depth.
+const COLOUR: u8 = 0;
+const WITH_DEPTH: u8 = 1;
+const WITH_DOMINANT: u8 = 2;
+
 impl Rasterize<'_> {
+    #[inline(always)]
+    fn blend_by<S: Simd, const N: usize>(self, s: S) {
+        if !self.dominant.is_empty() {
+            self.blend::<S, WITH_DOMINANT, N>(s);
+        } else if matches!(self.depth_plane, DepthPlane::Unused) {
+            self.blend::<S, COLOUR, N>(s);
+        } else {
+            self.blend::<S, WITH_DEPTH, N>(s);
+        }
+    }
+
     /// Blends the list into the tile, `N` vectors of a patch at a time.
     #[inline(always)]
     #[expect(clippy::too_many_lines, reason = "a numeric kernel")]
-    fn blend<S: Simd, const WITH_EXTRAS: bool, const N: usize>(self, s: S) {
+    fn blend<S: Simd, const WITH: u8, const N: usize>(self, s: S) {
         let Self { splats, list, place, background, dominant, canvas, blending, batch, .. } = self;
         let counts = matches!(self.depth_plane, DepthPlane::BlendedCount);
         let is_inverse = matches!(self.depth_plane, DepthPlane::Inverse | DepthPlane::Distance(_));
         // Differences from the given depth are added as they are, or as distances.
-        let given = if WITH_EXTRAS { self.depth_plane.given(&place) } else { ZERO_PLANE };
+        let given = if WITH != COLOUR { self.depth_plane.given(&place) } else { ZERO_PLANE };
         let sign = if matches!(self.depth_plane, DepthPlane::Distance(_)) { -1.0 } else { 1.0 };
         let c = |x: f32| V::splat(s, x);
         let (e_min, t_min) = (c(-blending.log2_reach), c(blending.transmittance_min));
@@ -250,7 +259,7 @@ impl Rasterize<'_> {
                 break;
             }
             batch.set(s, splats, chunk, &place);
-            if WITH_EXTRAS && is_inverse {
+            if WITH != COLOUR && is_inverse {
                 for splat in &mut batch.splats[..chunk.len()] {
                     splat.depth = 1.0 / splat.depth;
                 }
@@ -319,13 +328,15 @@ impl Rasterize<'_> {
                             r[n] = w.mul_add(c(splat.colour[0]), r[n]);
                             g[n] = w.mul_add(c(splat.colour[1]), g[n]);
                             b[n] = w.mul_add(c(splat.colour[2]), b[n]);
-                            if WITH_EXTRAS {
+                            if WITH != COLOUR {
                                 at_depth[n] = if counts {
                                     at_depth[n] + zero.lt(w).keep(c(1.0))
                                 } else {
                                     let difference = c(splat.depth) - given[n];
                                     w.mul_add(difference.max(difference * sign), at_depth[n])
                                 };
+                            }
+                            if WITH == WITH_DOMINANT {
                                 let here = s.splat_u32s(first + i as u32);
                                 let largest_at = &mut largest_at[p][at + n * S::F32_LANES..];
                                 let largest_at = &mut S::as_mut_simd_u32s(largest_at).0[0];
@@ -339,8 +350,10 @@ impl Rasterize<'_> {
                     store_of(r, &mut red[p][at..]);
                     store_of(g, &mut green[p][at..]);
                     store_of(b, &mut blue[p][at..]);
-                    if WITH_EXTRAS {
+                    if WITH != COLOUR {
                         store_of(at_depth, &mut depth[p][at..]);
+                    }
+                    if WITH == WITH_DOMINANT {
                         store_of(w_max, &mut largest.0[p][at..]);
                     }
                     for t in t {
@@ -361,7 +374,7 @@ impl Rasterize<'_> {
                 add_product(s, t, c(background[2]), &mut blue[p][at..]);
             }
         }
-        if WITH_EXTRAS && !dominant.is_empty() {
+        if WITH == WITH_DOMINANT {
             let pixels = largest.0.as_flattened().iter().zip(largest_at.as_flattened());
             for (_, &at) in pixels.filter(|(weight, _)| **weight > 0.0) {
                 let row = Entry::load(&list[at as usize]).row;
