@@ -20,87 +20,63 @@ use pulp::{Simd, WithSimd};
 use rayon::prelude::*;
 
 use super::CpuBackend;
+use super::depth_channel::{BY_ALPHA, CENTRE, DepthChannel, SQUARE};
+use super::passes::Frame;
 use super::rasterize::{
     DEPTH, DepthPlane, Plane, TRANSMITTANCE, TileCanvas, TilePlace, ZERO_PLANE, set_row_of_plane,
 };
 use super::rasterize_bwd::{BY_DEPTH, TileGradient};
-use super::simd::{SIGN, WIDTH};
+use super::simd::WIDTH;
 use super::tiles::{Grid, TILE};
 use crate::StepInput;
 use crate::depth::{DepthLoss, DepthTerm, confidence_in};
-use crate::signals::Field;
-
-/// The planes of the canvas that hold c, n and a; m is in the plane [`BY_DEPTH`] of the gradient.
-pub(super) const CENTRE: usize = DEPTH;
-pub(super) const SQUARE: usize = 0;
-pub(super) const BY_ALPHA: usize = 1;
+use crate::signals::{Field, RecordLayout};
 
 /// Pixels per task when confidences are added up.
 const PIXELS_PER_TASK: usize = 1 << 16;
 
-/// How the depth channel depends on a splat's depth z.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct DepthChannel {
-    /// True if x is 1/z, false if it is z.
-    is_inverse: bool,
-    /// True if the channel has squares.
-    pub(super) has_squares: bool,
-    /// The sign bit if ρ is the absolute value, 0 if it is the identity.
-    pub(super) sign_bit: u32,
-}
-
-impl DepthChannel {
-    /// Depth itself.
-    pub(super) const DEPTH: Self = Self { is_inverse: false, has_squares: false, sign_bit: 0 };
-
-    pub(super) fn of_loss(loss: &DepthLoss<'_>) -> Self {
-        let sign_bit = match loss.term {
-            DepthTerm::Expected => 0,
-            DepthTerm::Samples => SIGN,
-        };
-        Self { is_inverse: true, has_squares: loss.distortion > 0.0, sign_bit }
-    }
-
-    /// x of a splat.
-    #[inline(always)]
-    pub(super) fn value(self, depth: f32) -> f32 {
-        if self.is_inverse { 1.0 / depth } else { depth }
-    }
-
-    /// dx/dz.
-    #[inline(always)]
-    pub(super) fn derivative(self, depth: f32) -> f32 {
-        if self.is_inverse { -(1.0 / depth) * (1.0 / depth) } else { 1.0 }
-    }
-}
-
-impl<'a> DepthPlane<'a> {
-    /// What the forward pass must accumulate for a loss.
-    pub(super) fn of_loss(loss: DepthLoss<'a>) -> Self {
-        match loss.term {
-            DepthTerm::Expected => Self::Inverse,
-            DepthTerm::Samples => Self::Distance(loss),
-        }
-    }
-}
-
 impl CpuBackend {
-    /// The depth in the loss of a step, if there is any.
-    pub(super) fn depth_loss<'a>(&self, input: &StepInput<'a>) -> Option<DepthLoss<'a>> {
+    /// The depth in the loss of a step, if there is any, and what the forward pass must accumulate for it.
+    pub(super) fn depth_loss<'a>(
+        &self,
+        input: &StepInput<'a>,
+    ) -> (Option<DepthLoss<'a>>, DepthPlane<'a>) {
         let is_set_up = self.signals.layout().has(Field::Depth);
-        DepthLoss::new(input, self.near, is_set_up, |map, mask| {
+        let loss = DepthLoss::new(input, self.near, is_set_up, |map, mask| {
             let pixels = map.inverse.len();
             let tasks = (0..pixels.div_ceil(PIXELS_PER_TASK)).into_par_iter();
             self.threads.sum("confidences", tasks, |task| {
                 let first = task * PIXELS_PER_TASK;
                 confidence_in(map, mask, first..pixels.min(first + PIXELS_PER_TASK))
             })
-        })
+        });
+        let plane = loss.map_or(DepthPlane::Unused, |loss| match loss.term {
+            DepthTerm::Expected => DepthPlane::Inverse,
+            DepthTerm::Samples => DepthPlane::Distance(loss),
+        });
+        (loss, plane)
+    }
+
+    /// Stage 5 of a step, with or without depth in the loss: returns the layout of the records, and the value of the
+    /// depth term, without its weight, if depth is given.
+    pub(super) fn backward_with_depth(
+        &mut self,
+        frame: &Frame,
+        loss: Option<DepthLoss<'_>>,
+    ) -> (RecordLayout, Option<f32>) {
+        let layout = self.signals.layout();
+        let Some(loss) = loss else {
+            self.backward(frame, layout.without_depth(), DepthChannel::DEPTH);
+            return (layout.without_depth(), None);
+        };
+        let value = self.depth_gradient(&frame.grid, loss);
+        self.backward(frame, layout, DepthChannel::of_loss(&loss));
+        (layout, value)
     }
 
     /// Writes the channel of the backward pass, and returns the value of the depth term, without its weight, if depth
     /// is given.
-    pub(super) fn depth_gradient(&mut self, grid: &Grid, loss: DepthLoss<'_>) -> Option<f32> {
+    fn depth_gradient(&mut self, grid: &Grid, loss: DepthLoss<'_>) -> Option<f32> {
         let Self { threads, arch, canvas, gradient, clock, .. } = self;
         let tasks = (
             canvas[..grid.tiles()].par_chunks_mut(grid.columns),

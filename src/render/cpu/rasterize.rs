@@ -15,7 +15,6 @@ use std::sync::atomic::{AtomicU32, AtomicU64, Ordering::Relaxed};
 use pulp::{Simd, WithSimd};
 
 use super::batch::{BATCH, Batch};
-use super::depth_gradient::GivenTile;
 use super::project::Splat;
 use super::simd::{V, WIDTH, exp2_of, load_of, store_of};
 use super::tiles::{Entry, Grid, TILE};
@@ -54,16 +53,6 @@ pub(super) enum DepthPlane<'a> {
     /// The distance of inverse depth from the given one, weighted as in blending; where none is given, as
     /// [`Inverse`](Self::Inverse).
     Distance(DepthLoss<'a>),
-}
-
-impl DepthPlane<'_> {
-    /// The inverse depth given in each pixel of a tile, from which distances are taken; 0 where there is none.
-    fn given(self, place: &TilePlace) -> Plane {
-        match self {
-            Self::Distance(loss) => GivenTile::new(&loss, place).inverse,
-            _ => ZERO_PLANE,
-        }
-    }
 }
 
 /// Planes of a rendered tile: red, green, blue, final transmittance, depth. Before the backward pass of a step with
@@ -185,6 +174,8 @@ pub(super) struct Rasterize<'a> {
     pub(super) place: TilePlace,
     pub(super) background: [f32; 3],
     pub(super) depth_plane: DepthPlane<'a>,
+    /// Inverse depths from which [distances](DepthPlane::Distance) are taken; 0 where none is given.
+    pub(super) given: Option<&'a Plane>,
     /// The number of pixels in which each row has the largest blend weight, to which the tile adds its pixels; empty
     /// if they are not counted. The counts are integers, so that the order of tiles does not matter.
     pub(super) dominant: &'a [AtomicU32],
@@ -233,7 +224,7 @@ impl Rasterize<'_> {
         let counts = matches!(self.depth_plane, DepthPlane::BlendedCount);
         let is_inverse = matches!(self.depth_plane, DepthPlane::Inverse | DepthPlane::Distance(_));
         // Differences from the given depth are added as they are, or as distances.
-        let given = if WITH != COLOUR { self.depth_plane.given(&place) } else { ZERO_PLANE };
+        let given = self.given.unwrap_or(const { &ZERO_PLANE });
         let sign = if matches!(self.depth_plane, DepthPlane::Distance(_)) { -1.0 } else { 1.0 };
         let c = |x: f32| V::splat(s, x);
         let (e_min, t_min) = (c(-blending.log2_reach), c(blending.transmittance_min));

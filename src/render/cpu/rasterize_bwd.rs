@@ -16,24 +16,25 @@
 //! covariance's gradient is ½·L·M·Lᵀ with M the matrix of second moments; it is never formed, see `project_bwd`.
 //!
 //! Depth is one more channel. The value of a splat with (inverse) depth x in a pixel is m·ρ(x − c) + n·(x − c)², where
-//! ρ is the identity or the absolute value; see [`depth_gradient`]. Nothing
+//! ρ is the identity or the absolute value; see
+//! [`depth_gradient`](super::depth_gradient). Nothing
 //! is behind the last splat, so this channel adds nothing to the first b. A gradient with respect to alpha has the same
 //! value for every splat, so it is subtracted from the first b instead.
 //!
 //! Records are summed per row in order of tile number, so that the sum does not depend on the number of threads.
 
-use std::sync::atomic::{AtomicU32, AtomicU64, Ordering::Relaxed};
+use std::sync::atomic::AtomicU64;
 
 use bytemuck::Zeroable;
 use pulp::{Simd, WithSimd};
 
 use super::batch::{BATCH, Batch};
-use super::depth_gradient::{self, DepthChannel};
+use super::depth_channel::{BY_ALPHA, CENTRE, DepthChannel, SQUARE};
 use super::project::Splat;
 use super::rasterize::{
     ALPHA_MAX, Aligned, Blending, PATCHES, Plane, TRANSMITTANCE, TileCanvas, TilePlace, ZERO_PLANE,
 };
-use super::records::TileRecords;
+use super::records::{TileRecords, write};
 use super::simd::{V, WIDTH, each, sums_of_four};
 use super::tiles::Entry;
 use crate::signals::{BASE, Field, RecordLayout};
@@ -240,8 +241,7 @@ impl RasterizeBwd<'_> {
         let c = |x: f32| V::splat(s, x);
         let [gr, gg, gb, by_depth, errors] = &upstream.planes;
         let [centre, square, by_alpha] =
-            [depth_gradient::CENTRE, depth_gradient::SQUARE, depth_gradient::BY_ALPHA]
-                .map(|plane| &canvas.planes[plane]);
+            [CENTRE, SQUARE, BY_ALPHA].map(|plane| &canvas.planes[plane]);
 
         // State per pixel behind the current splat.
         let mut transmittance = Aligned(canvas.planes[TRANSMITTANCE]);
@@ -383,50 +383,3 @@ impl RasterizeBwd<'_> {
         }
     }
 }
-
-/// Writes the values that the layout has.
-#[inline(always)]
-fn write(to: Option<&[AtomicU32]>, all: &[f32; RecordLayout::MOST], layout: RecordLayout) {
-    let Some((base, extras)) = to.and_then(|to| to.split_at_checked(BASE)) else { return };
-    for (to, x) in base.iter().zip(all) {
-        to.store(x.to_bits(), Relaxed);
-    }
-    for (to, &number) in extras.iter().zip(layout.extras()) {
-        to.store(all[usize::from(number)].to_bits(), Relaxed);
-    }
-}
-
-/// Adds up the records of one row, which are adjacent, in order. `sums` has the shape of a record.
-pub(super) fn gather(sums: &mut [f32], layout: RecordLayout, records: &[AtomicU32]) {
-    let maximum = layout.has(Field::WeightMax);
-    match sums.len() {
-        9 => gather_all::<9>(sums, maximum, records),
-        10 => gather_all::<10>(sums, maximum, records),
-        11 => gather_all::<11>(sums, maximum, records),
-        12 => gather_all::<12>(sums, maximum, records),
-        13 => gather_all::<13>(sums, maximum, records),
-        14 => gather_all::<14>(sums, maximum, records),
-        15 => gather_all::<15>(sums, maximum, records),
-        _ => gather_all::<{ RecordLayout::MOST }>(sums, maximum, records),
-    }
-}
-
-/// Adds records of `STRIDE` values to `sums`; the last value may be a maximum.
-#[inline(always)]
-pub(super) fn gather_all<const STRIDE: usize>(
-    sums: &mut [f32],
-    maximum: bool,
-    records: &[AtomicU32],
-) {
-    let mut total: [f32; STRIDE] = std::array::from_fn(|i| sums[i]);
-    for record in records.as_chunks::<STRIDE>().0 {
-        for i in 0..STRIDE {
-            let x = f32::from_bits(record[i].load(Relaxed));
-            let is_maximum = maximum && i == STRIDE - 1;
-            total[i] = if is_maximum { total[i].max(x) } else { total[i] + x };
-        }
-    }
-    sums.copy_from_slice(&total);
-}
-
-const _: () = assert!(BASE == 9 && RecordLayout::MOST == 16, "`gather` lists every length");
