@@ -142,6 +142,7 @@ pub const STAGES: &[Stage] = &[
     stage("rasterize", On::Tiles, &[VIEW, QUADS, shader!("rasterize")]),
     stage("exposure", On::All, &[VIEW, shader!("exposure")]),
     stage("loss", On::All, &[VIEW, shader!("loss")]),
+    stage("depth_gradient", On::All, &[VIEW, shader!("depth_gradient")]),
     stage("rasterize_bwd", On::Slots, &[VIEW, RECORD, QUADS, BACKWARD, shader!("rasterize_bwd")]),
     stage(
         "rasterize_bwd_atomic",

@@ -79,7 +79,7 @@ fn project(@builtin(global_invocation_id) id: vec3<u32>) {
     let l1 = factor.x * EXPONENT_SCALE;
     let l3 = factor.z * EXPONENT_SCALE;
     splats[3u * i] = vec4(u, v, l1, factor.y);
-    splats[3u * i + 1u] = vec4(l3, log2_opacity, g.p.z, 0.0);
+    splats[3u * i + 1u] = vec4(l3, log2_opacity, g.p.z, g.inv_z);
     splats[3u * i + 2u] = vec4(max(raw, vec3(0.0)), 0.0);
     depths[i] = bitcast<u32>(g.p.z);
 

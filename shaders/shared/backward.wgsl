@@ -3,11 +3,14 @@
 
 @group(0) @binding(6) var<storage, read> finish: array<vec2<u32>>;
 // Planes of dL/dpixel: red, green, blue, and, if MORE is set, alpha and depth. If MORE is not set, a plane of
-// the pixels' errors follows, provided that records have a sum of errors.
+// the pixels' errors follows, provided that records have a sum of errors; and from DEPTH_PLANE on, if records have a
+// gradient of depth, the two planes of depth_gradient.wgsl.
 @group(0) @binding(7) var<storage, read> pixel_gradient: array<f32>;
 
 // True if alpha and depth have gradients.
 override MORE: bool = false;
+// The first plane of depth in the loss.
+override DEPTH_PLANE: u32 = 0;
 
 // dL/dpixel of an invocation's pixels; 0 outside the image.
 struct Upstream {
@@ -15,8 +18,11 @@ struct Upstream {
     green: vec4<f32>,
     blue: vec4<f32>,
     alpha: vec4<f32>,
-    // dL/ddepth, or the error.
-    map: vec4<f32>,
+    error: vec4<f32>,
+    // The channel of depth: centre, and factors of the distance from it and of its square.
+    centre: vec4<f32>,
+    depth: vec4<f32>,
+    square: vec4<f32>,
 }
 
 // The state of the pixels behind the current splat: the transmittance there, the product of dL/dpixel with the colour
@@ -39,12 +45,23 @@ fn plane(n: u32, quad: Quad) -> vec4<f32> {
 }
 
 fn upstream(quad: Quad) -> Upstream {
-    var g = Upstream(plane(0u, quad), plane(1u, quad), plane(2u, quad), vec4(0.0), vec4(0.0));
+    let zero = vec4(0.0);
+    var g = Upstream(plane(0u, quad), plane(1u, quad), plane(2u, quad), zero, zero, zero, zero, zero);
     if MORE {
         g.alpha = plane(3u, quad);
-        g.map = plane(4u, quad);
-    } else if ERROR_AT > 0u {
-        g.map = plane(3u, quad);
+        g.depth = plane(4u, quad);
+        return g;
+    }
+    if ERROR_AT > 0u {
+        g.error = plane(3u, quad);
+    }
+    if DEPTH_AT > 0u && (frame.draw.w & INVERSE_DEPTH) != 0u {
+        let centre = plane(DEPTH_PLANE, quad);
+        let factor = plane(DEPTH_PLANE + 1u, quad);
+        g.centre = abs(centre);
+        g.depth = select(factor, zero, centre < zero);
+        g.square = select(zero, factor, centre < zero);
+        g.alpha = bitcast<f32>(frame.frozen.w) * g.depth;
     }
     return g;
 }
@@ -96,8 +113,15 @@ fn backpropagate(
     let w = alpha * (*pixels).light;
     let rgb = splat.colour;
     var here = rgb.x * own.red + rgb.y * own.green + rgb.z * own.blue;
-    if MORE {
-        here += own.alpha + splat.b.z * own.map;
+    // The derivative of the channel of depth, per pixel.
+    var by_depth = vec4(0.0);
+    if DEPTH_AT > 0u {
+        let x = select(splat.b.w, splat.b.z, MORE) - own.centre;
+        let takes_distance = (frame.draw.w & DEPTH_DISTANCES) != 0u;
+        let slope = select(own.depth, -own.depth, (x < vec4(0.0)) & vec4(takes_distance));
+        let chord = slope + own.square * x;
+        here += own.alpha + x * chord;
+        by_depth = chord + own.square * x;
     }
     let ahead = here - (*pixels).seen;
     (*pixels).seen = select((*pixels).seen, (*pixels).seen + alpha * ahead, takes);
@@ -130,10 +154,11 @@ fn backpropagate(
         (*sums)[PIXEL_COUNT_AT] = total(select(vec4(0.0), vec4(1.0), w > vec4(0.0)));
     }
     if DEPTH_AT > 0u {
-        (*sums)[DEPTH_AT] = total(w * own.map);
+        // d(1/z)/dz = −1/z².
+        (*sums)[DEPTH_AT] = total(w * by_depth) * select(-splat.b.w * splat.b.w, 1.0, MORE);
     }
     if ERROR_AT > 0u {
-        (*sums)[ERROR_AT] = total(w * own.map);
+        (*sums)[ERROR_AT] = total(w * own.error);
     }
     if WEIGHT_MAX_AT > 0u {
         (*sums)[WEIGHT_MAX_AT] = largest(w);

@@ -12,12 +12,12 @@
 const MEMBERS: u32 = 64u;
 
 // Length of the longest record.
-const FIELDS: u32 = 15u;
+const FIELDS: u32 = 16u;
 
 struct Splat {
     // Mean within the tile [px], l1, shear.
     a: vec4<f32>,
-    // l3, log2 of the opacity, depth.
+    // l3, log2 of the opacity, depth, inverse depth.
     b: vec4<f32>,
     colour: vec4<f32>,
 }

@@ -28,7 +28,7 @@ impl GpuDevice {
         match *self {}
     }
 
-    pub(super) fn max_pairs(&self, _: &Needs) -> u64 {
+    pub(super) fn max_pairs(&self, _: &Needs, _: bool) -> u64 {
         match *self {}
     }
 
@@ -36,7 +36,7 @@ impl GpuDevice {
         match *self {}
     }
 
-    pub(super) fn run_canary(&self, _: &Needs) -> Result<(), BackendError> {
+    pub(super) fn run_canary(&self, _: &Needs, _: bool) -> Result<(), BackendError> {
         match *self {}
     }
 

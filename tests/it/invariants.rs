@@ -216,6 +216,7 @@ const MODULES: [(&str, &[&str]); 5] = [
             "adapter",
             "audit",
             "candidates",
+            "depth",
             "error",
             "inspect",
             "pixel_map",

@@ -10,22 +10,25 @@ use densify_core::gaussians::sh_coefficients;
 use densify_core::image::Image8;
 use densify_core::sh;
 
+/// The records of which gradients are read.
+const LAYOUT: RecordLayout = RecordLayout::DIFFERENTIATED;
+const STRIDE: usize = LAYOUT.stride();
+
 impl GpuBackend {
     /// Reads the gradients that stages 5 and 6 have computed.
     fn model_gradient(&self, degree: u8) -> Result<ModelGradient, BackendError> {
         let n = self.rows as u64;
         let gradient = self.read("gradient", 0, 80 * n)?;
-        let sums = self.read("row sums", 0, 4 * RecordLayout::MOST as u64 * n)?;
+        let sums = self.read("row sums", 0, 4 * STRIDE as u64 * n)?;
         let splats = self.read("splats", 0, 48 * n)?;
         let depths = self.read("depths", 0, 4 * n)?;
         let planes = 3 * sh_coefficients(self.sizes.sh_degree);
         let mut out = ModelGradient { sh: vec![0.0; planes * self.rows], ..Default::default() };
-        let rows =
-            gradient.as_chunks::<20>().0.iter().zip(sums.as_chunks::<{ RecordLayout::MOST }>().0);
+        let rows = gradient.as_chunks::<20>().0.iter().zip(sums.as_chunks::<STRIDE>().0);
         let rest = splats.as_chunks::<12>().0.iter().zip(depths);
         for (row, ((g, sums), (splat, depth))) in rows.zip(rest).enumerate() {
             let seen = depth.to_bits() != u32::MAX;
-            let sums = if seen { *sums } else { [0.0; RecordLayout::MOST] };
+            let sums = if seen { *sums } else { [0.0; STRIDE] };
             let l1 = if seen { splat[2] } else { 0.0 };
             let unscale = 1.0 / EXPONENT_SCALE;
             out.means.push([g[0], g[1], g[2]]);
@@ -33,7 +36,7 @@ impl GpuBackend {
             out.quats.push([g[6], g[7], g[8], g[9]]);
             out.opacity_logits.push(g[10]);
             out.mean2d.push([g[11], g[15]]);
-            let sum = |field: Field| sums[field.number()];
+            let sum = |field| LAYOUT.at(field).map_or(0.0, |at| sums[at]);
             out.mean2d_abs.push([
                 l1 * unscale * unscale * sum(Field::AbsX),
                 unscale * unscale * sum(Field::AbsY),
@@ -67,7 +70,7 @@ impl Differentiable for GpuBackend {
         upstream.assert_size(camera);
         assert_eq!(self.sizes.budget.frozen, 0, "frozen rows have no gradients");
         if !self.sizes.alpha_and_depth {
-            (self.sizes.alpha_and_depth, self.sizes.records) = (true, RecordLayout::DIFFERENTIATED);
+            (self.sizes.alpha_and_depth, self.sizes.records) = (true, LAYOUT);
             self.rebuild()?;
         }
         self.fit_image(camera.width, camera.height)?;

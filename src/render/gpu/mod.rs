@@ -14,6 +14,7 @@ mod audit;
 mod buffers;
 mod canary;
 mod clock;
+mod depth;
 mod device;
 mod differentiate;
 mod edits;
@@ -222,6 +223,7 @@ fn launches(
     let variant = Variant {
         records,
         alpha_and_depth,
+        depth_plane: sizes.depth.then(|| sizes.depth_plane()),
         shortcuts,
         formats: sizes.formats(),
         counts_dominant,

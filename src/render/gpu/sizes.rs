@@ -71,6 +71,8 @@ pub(super) struct Sizes {
     pub(super) with_edges: bool,
     /// True if photographs have exposures.
     pub(super) exposures: bool,
+    /// True if depth may be in the loss.
+    pub(super) depth: bool,
 }
 
 /// A buffer to allocate.
@@ -107,9 +109,10 @@ impl Sizes {
         sh_degree: u8,
         image: (u32, u32),
         needs: &Needs,
+        depth: bool,
         accumulation: Accumulation,
     ) -> Self {
-        let records = RecordLayout::new(needs.signals, false);
+        let records = RecordLayout::new(needs.signals, depth);
         Self {
             budget,
             cap,
@@ -127,7 +130,18 @@ impl Sizes {
             with_edges: records.has(Field::Error) && needs.error_score.edge > 0.0,
             with_error: needs.candidates.is_some_and(|r| r.error != ErrorMode::Gradient),
             exposures: false,
+            depth,
         }
+    }
+
+    /// The planes of an image gradient in front of those of depth in the loss, and the number of the latter.
+    pub(super) fn depth_plane(&self) -> u64 {
+        let errors = u64::from(self.records.has(Field::Error));
+        3 + errors * (1 + u64::from(self.with_edges))
+    }
+
+    fn depth_planes(&self) -> u64 {
+        2 * u64::from(self.depth)
     }
 
     /// True if gradients may be summed over several iterations before an optimiser step: `[geometry and band 0, bands
@@ -230,10 +244,12 @@ impl Sizes {
         add(Section::Tiles, "tiles", "tile counts", 4 * tiles);
         add(Section::Renderer, "image and image gradient", "canvas", 16 * pixels);
         add(Section::Renderer, "image and image gradient", "finish", 8 * pixels);
-        let errors = u64::from(self.records.has(Field::Error));
         let channels =
-            if self.alpha_and_depth { 5 } else { 3 + errors * (1 + u64::from(self.with_edges)) };
+            if self.alpha_and_depth { 5 } else { self.depth_plane() + self.depth_planes() };
         add(Section::Renderer, "image and image gradient", "pixel gradient", 4 * channels * pixels);
+        if self.depth {
+            add(Section::Images, "given depth on the device", "given depth", 4 * pixels);
+        }
         let scratch = self.ranges().iter().map(|range| range.at + range.bytes).max();
         add(Section::Renderer, "sorts, loss, row gradients", SCRATCH, scratch.unwrap_or(0));
         add(Section::Renderer, "loss", "tile sums", 8 * tiles);
@@ -338,7 +354,8 @@ mod tests {
         const ROWS: usize = 1_000_000;
         let bytes_per_row = |pairs: u64, storage, accumulation| {
             let cap = pairs * ROWS as u64;
-            let mut sizes = Sizes::new(ROWS.into(), cap, 3, (1600, 1000), &needs(), accumulation);
+            let mut sizes =
+                Sizes::new(ROWS.into(), cap, 3, (1600, 1000), &needs(), false, accumulation);
             assert_eq!((sizes.planes, sizes.records.stride()), (9, 10));
             sizes.storage = storage;
             sizes.ledger().on_device().div_ceil(ROWS as u64)

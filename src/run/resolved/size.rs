@@ -315,7 +315,7 @@ fn request(case: &Case<'_>, memory: u64) -> Result<SizeRequest, Failure> {
 
 /// Maximum number of (row, tile) pairs that the backend supports at a time.
 fn max_pairs(case: &Case<'_>, rows: usize) -> Result<usize, Failure> {
-    Ok(case.inputs.device.most_pairs(&case.needs(rows)?))
+    Ok(case.inputs.device.most_pairs(&case.needs(rows)?, false))
 }
 
 /// The error if not even the smallest model fits: the memory that it takes, and verified changes of options with which
