@@ -145,6 +145,7 @@ pub const STAGES: &[Stage] = &[
     stage("rasterize", On::Tiles, &[VIEW, SPLAT, QUADS, shader!("rasterize")]),
     stage("exposure", On::All, &[VIEW, shader!("exposure")]),
     stage("loss", On::All, &[VIEW, shader!("loss")]),
+    stage("depth_gradient", On::All, &[VIEW, shader!("depth_gradient")]),
     stage(
         "rasterize_bwd",
         On::Slots,

@@ -20,6 +20,8 @@ struct Accumulated {
     green: vec4<f32>,
     blue: vec4<f32>,
     depth: vec4<f32>,
+    // Inverse depth from which distances are taken; 0 where none is given.
+    given: vec4<f32>,
     stop: vec4<u32>,
     // The largest blend weight, and the index of its splat in the tile's list.
     most: vec4<f32>,
@@ -44,7 +46,14 @@ fn blend_splat(
     (*accumulated).red += w * splat.colour.x;
     (*accumulated).green += w * splat.colour.y;
     (*accumulated).blue += w * splat.colour.z;
-    (*accumulated).depth += w * splat.b.z;
+    if DEPTH_IN_LOSS {
+        let x = select(splat.b.z, splat.b.w, (frame.draw.w & INVERSE_DEPTH) != 0u);
+        let difference = x - (*accumulated).given;
+        let by_distance = (frame.draw.w & DEPTH_DISTANCES) != 0u;
+        (*accumulated).depth += w * select(difference, abs(difference), by_distance);
+    } else {
+        (*accumulated).depth += w * splat.b.z;
+    }
     if COUNTS_DOMINANT {
         (*accumulated).most_at = select((*accumulated).most_at, vec4(n + k), w > (*accumulated).most);
         (*accumulated).most = max((*accumulated).most, w);
@@ -69,7 +78,15 @@ fn rasterize(
     let end = tile_starts[tile + 1u];
     var pixels = ForwardPixels(vec4(1.0), quad.inside);
     let zero = vec4(0.0);
-    var accumulated = Accumulated(zero, zero, zero, zero, vec4(NONE), zero, vec4(0u));
+    var accumulated = Accumulated(zero, zero, zero, zero, zero, vec4(NONE), zero, vec4(0u));
+    if DEPTH_IN_LOSS && (frame.draw.w & DEPTH_DISTANCES) != 0u {
+        for (var p = 0u; p < 4u; p++) {
+            if quad.inside[p] {
+                // Written by `place_depth` (depth_gradient.wgsl).
+                accumulated.given[p] = canvas[quad.place[p]].w;
+            }
+        }
+    }
     var completed = true;
     var first = begin;
     for (; first < end; first += m.members) {

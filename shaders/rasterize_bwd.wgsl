@@ -59,17 +59,20 @@ fn rasterize_bwd(
         let count = min(BATCH, reached - first);
         load_batch(begin + first, count, lane, quad.corner);
         // Four splats per round, back to front. Unrolled by hand: compilers do not unroll a body of this
-        // size.
+        // size. Of the longest records, shared memory holds the parts of only three.
+        let splats_per_round = select(SPLATS, 3u, RECORD == FIELDS);
         var top = i32(count);
-        for (; top > 0; top -= i32(SPLATS)) {
+        for (; top > 0; top -= i32(splats_per_round)) {
             store_splat(0u, top - 1, first, lane, quad, own, &pixels);
             store_splat(1u, top - 2, first, lane, quad, own, &pixels);
             store_splat(2u, top - 3, first, lane, quad, own, &pixels);
-            store_splat(3u, top - 4, first, lane, quad, own, &pixels);
+            if splats_per_round > 3u {
+                store_splat(3u, top - 4, first, lane, quad, own, &pixels);
+            }
             wait_for_all();
             // One invocation per field of each splat.
             let which = top - 1 - i32(lane / RECORD);
-            if lane < SPLATS * RECORD && which >= 0 {
+            if lane < splats_per_round * RECORD && which >= 0 {
                 let f = lane % RECORD;
                 records[slots[which] * RECORD + f] = summed(lane, f == maximum());
             }

@@ -15,8 +15,11 @@ struct Upstream {
     green: vec4<f32>,
     blue: vec4<f32>,
     alpha: vec4<f32>,
-    // dL/ddepth, or the error.
-    map: vec4<f32>,
+    error: vec4<f32>,
+    // The channel of depth: centre, and factors of the distance from it and of its square.
+    centre: vec4<f32>,
+    depth: vec4<f32>,
+    square: vec4<f32>,
 }
 
 // The state of the pixels behind the current splat: the transmittance there, the product of dL/dpixel with the colour
@@ -28,7 +31,9 @@ struct BackwardPixels {
 }
 
 fn upstream(quad: Quad) -> Upstream {
-    var g = Upstream(vec4(0.0), vec4(0.0), vec4(0.0), vec4(0.0), vec4(0.0));
+    let zero = vec4(0.0);
+    var g = Upstream(zero, zero, zero, zero, zero, zero, zero, zero);
+    let size = frame.image.x * frame.image.y;
     for (var p = 0u; p < 4u; p++) {
         if quad.inside[p] {
             let at = select(1u, 2u, MORE) * quad.place[p];
@@ -36,11 +41,22 @@ fn upstream(quad: Quad) -> Upstream {
             g.red[p] = here.x;
             g.green[p] = here.y;
             g.blue[p] = here.z;
-            if MORE || ERROR_AT > 0u {
-                g.map[p] = here.w;
-            }
             if MORE {
+                g.depth[p] = here.w;
                 g.alpha[p] = pixel_gradient[at + 1u].x;
+                continue;
+            }
+            if ERROR_AT > 0u {
+                g.error[p] = here.w;
+            }
+            if DEPTH_AT > 0u && (frame.draw.w & INVERSE_DEPTH) != 0u {
+                // See depth_gradient.wgsl.
+                let channel = bitcast<vec2<f32>>(finish[size + at]);
+                let is_square = channel.x < 0.0;
+                g.centre[p] = abs(channel.x);
+                g.depth[p] = select(channel.y, 0.0, is_square);
+                g.square[p] = select(0.0, channel.y, is_square);
+                g.alpha[p] = bitcast<f32>(frame.frozen.w) * g.depth[p];
             }
         }
     }
@@ -94,8 +110,15 @@ fn backpropagate(
     let w = alpha * (*pixels).light;
     let rgb = splat.colour;
     var here = rgb.x * own.red + rgb.y * own.green + rgb.z * own.blue;
-    if MORE {
-        here += own.alpha + splat.b.z * own.map;
+    // The derivative of the channel of depth, per pixel.
+    var by_depth = vec4(0.0);
+    if DEPTH_AT > 0u {
+        let x = select(splat.b.w, splat.b.z, MORE) - own.centre;
+        let takes_distance = (frame.draw.w & DEPTH_DISTANCES) != 0u;
+        let slope = select(own.depth, -own.depth, (x < vec4(0.0)) & vec4(takes_distance));
+        let chord = slope + own.square * x;
+        here += own.alpha + x * chord;
+        by_depth = chord + own.square * x;
     }
     let ahead = here - (*pixels).seen;
     (*pixels).seen = select((*pixels).seen, (*pixels).seen + alpha * ahead, takes);
@@ -128,10 +151,11 @@ fn backpropagate(
         (*sums)[PIXEL_COUNT_AT] = total(select(vec4(0.0), vec4(1.0), w > vec4(0.0)));
     }
     if DEPTH_AT > 0u {
-        (*sums)[DEPTH_AT] = total(w * own.map);
+        // d(1/z)/dz = −1/z².
+        (*sums)[DEPTH_AT] = total(w * by_depth) * select(-splat.b.w * splat.b.w, 1.0, MORE);
     }
     if ERROR_AT > 0u {
-        (*sums)[ERROR_AT] = total(w * own.map);
+        (*sums)[ERROR_AT] = total(w * own.error);
     }
     if WEIGHT_MAX_AT > 0u {
         (*sums)[WEIGHT_MAX_AT] = largest(w);

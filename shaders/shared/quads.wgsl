@@ -12,12 +12,15 @@
 const MEMBERS: u32 = 64u;
 
 // Length of the longest record.
-const FIELDS: u32 = 15u;
+const FIELDS: u32 = 16u;
+
+// True if depth may be in the loss.
+override DEPTH_IN_LOSS: bool = false;
 
 struct Splat {
     // Mean within the tile [px], l1, shear.
     a: vec4<f32>,
-    // l3, log2 of the opacity, depth.
+    // l3, log2 of the opacity, depth, inverse depth (if DEPTH_IN_LOSS is set).
     b: vec4<f32>,
     colour: vec4<f32>,
 }
@@ -69,9 +72,14 @@ fn quad_of(tile: u32, lane: u32) -> Quad {
 fn splat_of(row: u32, corner: vec2<u32>) -> Splat {
     let at = SPLAT * row;
     let mean = vec2(splats[at], splats[at + 1u]) - vec2<f32>(corner);
+    let depth = splats[at + DEPTH];
+    var inverse_depth = 0.0;
+    if DEPTH_IN_LOSS {
+        inverse_depth = 1.0 / depth;
+    }
     return Splat(
         vec4(mean, splats[at + 2u], splats[at + 3u]),
-        vec4(splats[at + 4u], splats[at + 5u], splats[at + DEPTH], 0.0),
+        vec4(splats[at + 4u], splats[at + 5u], depth, inverse_depth),
         vec4(splats[at + 6u], splats[at + 7u], splats[at + 8u], 0.0),
     );
 }

@@ -30,7 +30,8 @@ struct Frame {
     // Seed, step, flags of the optimiser (see adam.wgsl), flags of the loss (see loss.wgsl).
     draw: vec4<u32>,
     // Number of frozen rows: they come first, never change, and have no entries in the arrays used only
-    // for training; unused ×3.
+    // for training. Then bits of f32 about given depth (depth_gradient.wgsl): the unit of its inverse and its
+    // median [scene units], and the gradient of alpha as a multiple of that of depth.
     frozen: vec4<u32>,
     // Plane that accumulates each signal in this step; NONE if the signal is not requested.
     planes: array<vec4<u32>, 8>,
@@ -55,7 +56,9 @@ struct State {
     // Means over pixels and channels.
     l1: f32,
     ssim: f32,
-    spare_f: vec2<f32>,
+    // The depth term of the loss, without its weight.
+    depth: f32,
+    spare_f: f32,
     // Band b consists of the tiles cuts[b]..cuts[b + 1].
     cuts: array<u32>,
 }
@@ -74,6 +77,12 @@ var<immediate> launch: Launch;
 const NONE: u32 = 0xffffffffu;
 const TILE: u32 = 16u;
 const GROUP: u32 = 256u;
+
+// Bits of frame.draw.w that concern depth (loss.wgsl has the others): the forward pass accumulates inverse depth; or,
+// where depth is given, its distance from that; depth is given.
+const INVERSE_DEPTH: u32 = 32u;
+const DEPTH_DISTANCES: u32 = 64u;
+const GIVEN_DEPTH: u32 = 128u;
 
 // Blending: the largest alpha; the transmittance at which a pixel stops; the smallest alpha, and −log2
 // of it. All but the first are settings.

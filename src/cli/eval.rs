@@ -156,13 +156,22 @@ pub(super) fn with_option_names(error: LimitError) -> Failure {
 
 /// The geometric measurements, one per line, with lengths as percentages of the scene's diagonal.
 fn format_table(geometry: &Geometry) -> String {
-    let Geometry { depth, normal_error, centres, floaters, thin, redundancy } = geometry;
+    let Geometry {
+        depth,
+        normal_error,
+        centres,
+        floaters,
+        weight_before_surface,
+        thin,
+        redundancy,
+    } = geometry;
     let plain = |value: f64, unit: &str| {
         if value.is_finite() { format!("{value:.2}{unit}") } else { "–".into() }
     };
     let mut lines = vec![
         ("depth RMSE (of the diagonal)".to_owned(), percent(depth.rmse)),
         ("depth error, relative".to_owned(), percent(depth.abs_rel)),
+        ("depth spread along rays (of the diagonal)".to_owned(), percent(depth.spread)),
         ("surface covered".to_owned(), percent(depth.coverage)),
         ("normal error, median".to_owned(), plain(*normal_error, "°")),
         ("centre to surface, mean (of the diagonal)".to_owned(), percent(centres.accuracy)),
@@ -174,6 +183,7 @@ fn format_table(geometry: &Geometry) -> String {
         ("floaters".to_owned(), grouped(floaters.count)),
         ("floaters, share of Gaussians".to_owned(), percent(floaters.of_rows)),
         ("floaters, share of weight".to_owned(), percent(floaters.of_weight)),
+        ("weight before the surface".to_owned(), percent(*weight_before_surface)),
     ];
     for structures in thin {
         let name = format!("thin structures found, {} px wide", structures.width);

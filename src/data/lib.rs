@@ -2,10 +2,11 @@
 //! This layer depends on neither backends nor runs.
 //!
 //! Its modules in order, each using only those before it: `error`, `picture_file`, `ply`, [`meshes`], [`models`], [`points`],
-//! [`dataset`], [`track_colours`] and [`views`].
+//! `las`, [`dataset`], [`track_colours`] and [`views`].
 
 pub mod dataset;
 mod error;
+mod las;
 pub mod meshes;
 pub mod models;
 mod picture_file;

@@ -139,11 +139,11 @@ impl Device {
         }
     }
 
-    /// The maximum number of (row, tile) pairs that the device can hold at a time.
-    pub fn most_pairs(&self, needs: &Needs) -> usize {
+    /// The maximum number of (row, tile) pairs that the device can hold at a time; `depth` as in [`Setup::depth`].
+    pub fn most_pairs(&self, needs: &Needs, depth: bool) -> usize {
         match self {
             Self::Processor => u32::MAX as usize,
-            Self::Gpu(device) => device.max_pairs(needs) as usize,
+            Self::Gpu(device) => device.max_pairs(needs, depth) as usize,
         }
     }
 
@@ -173,15 +173,16 @@ impl Device {
         }
     }
 
-    /// Compiles the GPU kernels for these needs and this storage and verifies their results on a small scene. Done before memory is
+    /// Compiles the GPU kernels for these needs and this storage, and for depth in the loss if `depth` is set, and verifies
+    /// their results on a small scene. Done before memory is
     /// planned: the plan must include the memory that the driver takes.
     ///
     /// # Errors
     /// When a kernel does not compile or its results are wrong.
-    pub fn prove(&self, needs: &Needs, storage: Storage) -> Result<(), BackendError> {
+    pub fn prove(&self, needs: &Needs, storage: Storage, depth: bool) -> Result<(), BackendError> {
         match self {
             Self::Processor => Ok(()),
-            Self::Gpu(device) => device.run_canary(needs, storage),
+            Self::Gpu(device) => device.run_canary(needs, storage, depth),
         }
     }
 

@@ -118,55 +118,63 @@ impl<'a> DepthLoss<'a> {
         Some(loss)
     }
 
-    /// The inverse depth given in a pixel `[1/scene units]`, with its confidence times its mask; the latter is 0 where
-    /// none is given.
+    /// The inverse depth given in a pixel `[1/scene units]`, its confidence times its mask, and its mask; the first two
+    /// are 0 where none is given.
     #[inline(always)]
-    pub(super) fn given(&self, pixel: usize) -> [f32; 2] {
-        let Some(map) = self.map else { return [0.0; 2] };
+    pub(super) fn given(&self, pixel: usize) -> [f32; 3] {
+        let mask = self.mask.map_or(1.0, |mask| f32::from(mask[pixel]) * (1.0 / 255.0));
+        let Some(map) = self.map else { return [0.0, 0.0, mask] };
         let [inverse, confidence] = map.inverse_depth(pixel);
-        [inverse, confidence * self.mask_at(pixel)]
+        let confidence = confidence * mask;
+        [if confidence > 0.0 { inverse } else { 0.0 }, confidence, mask]
     }
 
-    /// The mask of a pixel, in `[0, 1]`.
+    /// The part of a pixel, from what is [given](Self::given) there, its final transmittance and, as accumulated in the
+    /// forward pass, the weighted sum of x, or of |x − X*| for samples in pixels with given depth.
+    ///
+    /// Written without branches on pixels, so that the compiler can vectorise it.
     #[inline(always)]
-    fn mask_at(&self, pixel: usize) -> f32 {
-        self.mask.map_or(1.0, |mask| f32::from(mask[pixel]) * (1.0 / 255.0))
-    }
-
-    /// The part of a pixel, given its final transmittance and, as accumulated in the forward pass, the weighted sum of
-    /// x, or of |x − X*| for samples in pixels with given depth.
-    #[inline(always)]
-    pub(super) fn at_pixel(&self, pixel: usize, transmittance: f32, sum: f32) -> PixelDepth {
-        let [inverse, confidence] = self.given(pixel);
+    pub(super) fn at_pixel(
+        &self,
+        [inverse, confidence, mask]: [f32; 3],
+        transmittance: f32,
+        sum: f32,
+    ) -> PixelDepth {
+        let is_known = confidence > 0.0;
         let alpha = 1.0 - transmittance;
-        if confidence > 0.0 && self.term == DepthTerm::Samples {
-            let by_distance = confidence * self.by_distance;
-            let by_transmittance = confidence * self.by_transmittance;
-            return PixelDepth {
-                value: by_distance * sum + by_transmittance * transmittance,
-                centre: inverse,
-                by_depth: self.weight * by_distance,
-                square: 0.0,
-                by_alpha: -self.weight * by_transmittance,
-            };
-        }
-        if alpha <= 0.0 {
-            return PixelDepth::default();
-        }
-        let expected = sum / alpha;
-        let none = PixelDepth { centre: expected, ..PixelDepth::default() };
-        if confidence > 0.0 {
-            let (by_distance, error) = (confidence * self.by_distance, expected - inverse);
-            let slope = self.weight * by_distance / alpha;
-            let by_depth = if error > 0.0 { slope } else { -slope };
-            let by_depth = if error == 0.0 { 0.0 } else { by_depth };
-            return PixelDepth { value: by_distance * error.abs(), by_depth, ..none };
-        }
-        if expected < self.least_inverse {
-            return none;
-        }
-        let square = self.distortion * self.mask_at(pixel) / expected / expected;
-        PixelDepth { square, ..none }
+        let is_seen = alpha > 0.0;
+        let expected = sum / if is_seen { alpha } else { 1.0 };
+        let by_distance = confidence * self.by_distance;
+        let mut found = match self.term {
+            DepthTerm::Expected => {
+                let error = expected - inverse;
+                let slope = self.weight * by_distance / if is_seen { alpha } else { 1.0 };
+                let slope = if error < 0.0 { -slope } else { slope };
+                let is_off = is_seen & (error != 0.0);
+                let found = PixelDepth {
+                    value: if is_seen { by_distance * error.abs() } else { 0.0 },
+                    centre: expected,
+                    by_depth: if is_off { slope } else { 0.0 },
+                    ..PixelDepth::default()
+                };
+                found
+            }
+            DepthTerm::Samples => {
+                let by_transmittance = confidence * self.by_transmittance;
+                let found = PixelDepth {
+                    value: by_distance * sum + by_transmittance * transmittance,
+                    centre: if is_known { inverse } else { expected },
+                    by_depth: self.weight * by_distance,
+                    by_alpha: -self.weight * by_transmittance,
+                    square: 0.0,
+                };
+                found
+            }
+        };
+        let has_square = is_seen & !is_known & (expected >= self.least_inverse);
+        let square = self.distortion * mask / expected / expected;
+        found.square = if has_square { square } else { 0.0 };
+        found
     }
 }
 

@@ -30,7 +30,7 @@ impl GpuDevice {
         match *self {}
     }
 
-    pub(super) fn max_pairs(&self, _: &Needs) -> u64 {
+    pub(super) fn max_pairs(&self, _: &Needs, _: bool) -> u64 {
         match *self {}
     }
 
@@ -38,7 +38,7 @@ impl GpuDevice {
         match *self {}
     }
 
-    pub(super) fn run_canary(&self, _: &Needs, _: Storage) -> Result<(), BackendError> {
+    pub(super) fn run_canary(&self, _: &Needs, _: Storage, _: bool) -> Result<(), BackendError> {
         match *self {}
     }
 

@@ -38,6 +38,8 @@ INTENDED = [
     Intended("*", "*.out", MEMORY_TABLE, "train prints the table of memory only with -v"),
     Intended("extra/blocks", "*/logs/*.log", MEMORY_TABLE, "train prints the table of memory only with -v"),
     Intended("extra/meshes", "*/scene.json", None, "the notes of the scene generator are in plain English"),
+    Intended("*", "*geometry*.json", r'"(weight_before_surface|spread)":', "measurements that the reference lacks"),
+    Intended("*", "*.out", r"^(depth spread along rays|weight before the surface)", "measurements that it lacks"),
     Intended("*", "*config.toml", r'^coordinates = "auto"$', "an option that the reference does not have"),
 ]
 

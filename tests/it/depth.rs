@@ -14,7 +14,7 @@ use densify::selftest::reference::{CLASSES, Model, Rules, Upstream, View, blend}
 use densify::selftest::{Setup, Subject, scenes};
 use densify_policies::policy::{Needs, Signal, SignalSet};
 
-use crate::subject::{BLUE, make_with, natives, normalised, step_input};
+use crate::subject::{BLUE, all, make_with, normalised, repeatable, step_input};
 
 /// Step of the central difference, to either side.
 const STEP: f64 = 1e-6;
@@ -195,7 +195,7 @@ fn gradients_of_backends_match_the_reference() {
         let exact = gradient(&scene, &loss, &Rules::STANDARD, &upstream);
         // Errors of rows have a field of their own beside depth.
         for signals in [SignalSet::default(), SignalSet::from([Signal::WeightedError])] {
-            for subject in subjects() {
+            for subject in all() {
                 let needs = Needs { signals, ..Needs::default() };
                 let setup = Setup { depth: true, needs, tile_cap: Some(60), ..Setup::default() };
                 let mut backend = make_with(&subject, &scene.model, setup);
@@ -222,10 +222,6 @@ fn gradients_of_backends_match_the_reference() {
         }
     }
     table.finish();
-}
-
-fn subjects() -> Vec<Subject> {
-    natives()
 }
 
 /// The bits of a model.
@@ -259,7 +255,7 @@ const OFF: Terms = Terms { given: None, distortion: 0.0 };
 #[test]
 fn steps_without_depth_are_unchanged() {
     let scene = scene(37, 29, 14);
-    for subject in subjects() {
+    for subject in repeatable() {
         let run = |depth: bool| {
             let signals = SignalSet::from([Signal::ScreenGradientAbs, Signal::WeightMax]);
             let needs = Needs { signals, ..Needs::default() };
@@ -277,7 +273,7 @@ fn steps_without_depth_are_unchanged() {
 #[test]
 fn depth_is_reproducible() {
     let scene = scene(50, 37, 40);
-    for subject in subjects() {
+    for subject in repeatable() {
         for (case, terms) in ALL_TERMS {
             let run = |tile_cap: usize, record_cap: usize, threads: usize| {
                 let mut subject = subject.clone();
@@ -309,7 +305,7 @@ fn depth_is_reproducible() {
 fn maps_without_depth_have_no_effect() {
     let mut scene = scene(37, 29, 14);
     scene.map.confidence.fill(0);
-    for subject in subjects() {
+    for subject in repeatable() {
         let setup = || Setup { depth: true, tile_cap: Some(60), ..Setup::default() };
         let without = train(&subject, &scene, setup(), OFF);
         for terms in [EXPECTED, SAMPLES] {

@@ -142,12 +142,14 @@ mod tests {
             (ParameterStorage::F32, MomentStorage::F32, 59 * 4, 2 * 59 * 4),
             (ParameterStorage::F16, MomentStorage::Both8, 3 * 4 + 56 * 2, 2 * 59),
         ];
-        for (parameters, moments, of_parameters, of_moments) in formats {
+        let both = formats.into_iter().flat_map(|format| [(format, false, 9), (format, true, 10)]);
+        for ((parameters, moments, of_parameters, of_moments), depth, numbers) in both {
             let options = Setup {
                 storage: Storage { parameters, moments },
                 tile_cap: Some(300),
                 record_cap: 70,
                 threads: Some(1),
+                depth,
                 ..Setup::new(110)
             };
             let model = Gaussians { sh_degree: 3, ..Gaussians::default() };
@@ -159,7 +161,7 @@ mod tests {
             // 110 rows are seven blocks of sixteen.
             assert_eq!(line("parameters"), Some(112 * of_parameters), "{parameters:?}");
             assert_eq!(line("optimiser moments"), Some(112 * of_moments), "{moments:?}");
-            assert_eq!(line("gradients per entry"), Some(70 * 9 * 4));
+            assert_eq!(line("gradients per entry"), Some(70 * numbers * 4));
             let CpuBackend { params, moments, records, sums, splats, visible, .. } = &backend;
             assert_eq!(line("parameters"), Some(params.allocated_bytes()));
             assert_eq!(line("optimiser moments"), Some(moments.allocated_bytes()));

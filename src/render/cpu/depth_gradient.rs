@@ -20,82 +20,63 @@ use pulp::{Simd, WithSimd};
 use rayon::prelude::*;
 
 use super::CpuBackend;
-use super::rasterize::{DEPTH, DepthPlane, TRANSMITTANCE, TileCanvas, TilePlace, ZERO_PLANE};
+use super::depth_channel::{BY_ALPHA, CENTRE, DepthChannel, SQUARE};
+use super::passes::Frame;
+use super::rasterize::{
+    DEPTH, DepthPlane, Plane, TRANSMITTANCE, TileCanvas, TilePlace, ZERO_PLANE, set_row_of_plane,
+};
 use super::rasterize_bwd::{BY_DEPTH, TileGradient};
-use super::tiles::Grid;
+use super::simd::WIDTH;
+use super::tiles::{Grid, TILE};
 use crate::StepInput;
 use crate::depth::{DepthLoss, DepthTerm, confidence_in};
-use crate::signals::Field;
-
-/// The planes of the canvas that hold c, n and a; m is in the plane [`BY_DEPTH`] of the gradient.
-pub(super) const CENTRE: usize = DEPTH;
-pub(super) const SQUARE: usize = 0;
-pub(super) const BY_ALPHA: usize = 1;
+use crate::signals::{Field, RecordLayout};
 
 /// Pixels per task when confidences are added up.
 const PIXELS_PER_TASK: usize = 1 << 16;
 
-/// How the depth channel depends on a splat's depth z.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct DepthChannel {
-    /// True if x is 1/z, false if it is z.
-    is_inverse: bool,
-    /// ρ(x) is x where x >= 0, and `sign`·x elsewhere.
-    pub(super) sign: f32,
-}
-
-impl DepthChannel {
-    /// Depth itself.
-    pub(super) const DEPTH: Self = Self { is_inverse: false, sign: 1.0 };
-
-    pub(super) const fn of_loss(term: DepthTerm) -> Self {
-        let sign = match term {
-            DepthTerm::Expected => 1.0,
-            DepthTerm::Samples => -1.0,
-        };
-        Self { is_inverse: true, sign }
-    }
-
-    /// x of a splat.
-    #[inline(always)]
-    pub(super) fn value(self, depth: f32) -> f32 {
-        if self.is_inverse { 1.0 / depth } else { depth }
-    }
-
-    /// dx/dz.
-    #[inline(always)]
-    pub(super) fn derivative(self, depth: f32) -> f32 {
-        if self.is_inverse { -(1.0 / depth) * (1.0 / depth) } else { 1.0 }
-    }
-}
-
-impl<'a> DepthPlane<'a> {
-    /// What the forward pass must accumulate for a loss.
-    pub(super) fn of_loss(loss: DepthLoss<'a>) -> Self {
-        match loss.term {
-            DepthTerm::Expected => Self::Inverse,
-            DepthTerm::Samples => Self::Distance(loss),
-        }
-    }
-}
-
 impl CpuBackend {
-    /// The depth in the loss of a step, if there is any.
-    pub(super) fn depth_loss<'a>(&self, input: &StepInput<'a>) -> Option<DepthLoss<'a>> {
+    /// The depth in the loss of a step, if there is any, and what the forward pass must accumulate for it.
+    pub(super) fn depth_loss<'a>(
+        &self,
+        input: &StepInput<'a>,
+    ) -> (Option<DepthLoss<'a>>, DepthPlane<'a>) {
         let is_set_up = self.signals.layout().has(Field::Depth);
-        DepthLoss::new(input, self.near, is_set_up, |map, mask| {
+        let loss = DepthLoss::new(input, self.near, is_set_up, |map, mask| {
             let pixels = map.inverse.len();
             let tasks = (0..pixels.div_ceil(PIXELS_PER_TASK)).into_par_iter();
             self.threads.sum("confidences", tasks, |task| {
                 let first = task * PIXELS_PER_TASK;
                 confidence_in(map, mask, first..pixels.min(first + PIXELS_PER_TASK))
             })
-        })
+        });
+        let plane = loss.map_or(DepthPlane::Unused, |loss| match loss.term {
+            DepthTerm::Expected => DepthPlane::Inverse,
+            DepthTerm::Samples => DepthPlane::Distance(loss),
+        });
+        (loss, plane)
+    }
+
+    /// Stage 5 of a step, with or without depth in the loss: returns the layout of the records, and the value of the
+    /// depth term, without its weight, if depth is given.
+    pub(super) fn backward_with_depth(
+        &mut self,
+        frame: &Frame,
+        loss: Option<DepthLoss<'_>>,
+    ) -> (RecordLayout, Option<f32>) {
+        let layout = self.signals.layout();
+        let Some(loss) = loss else {
+            self.backward(frame, layout.without_depth(), DepthChannel::DEPTH);
+            return (layout.without_depth(), None);
+        };
+        let value = self.depth_gradient(&frame.grid, loss);
+        self.backward(frame, layout, DepthChannel::of_loss(&loss));
+        (layout, value)
     }
 
     /// Writes the channel of the backward pass, and returns the value of the depth term, without its weight, if depth
     /// is given.
-    pub(super) fn depth_gradient(&mut self, grid: &Grid, loss: DepthLoss<'_>) -> Option<f32> {
+    fn depth_gradient(&mut self, grid: &Grid, loss: DepthLoss<'_>) -> Option<f32> {
         let Self { threads, arch, canvas, gradient, clock, .. } = self;
         let tasks = (
             canvas[..grid.tiles()].par_chunks_mut(grid.columns),
@@ -125,26 +106,57 @@ impl WithSimd for DepthGradient<'_> {
     /// The value of the depth term in these pixels.
     type Output = f64;
 
+    /// Scalar loops, which the compiler vectorises for the dispatched instruction set.
     #[inline(always)]
     fn with_simd<S: Simd>(self, _: S) -> f64 {
         let Self { grid, first, loss, canvas, gradient } = self;
         let mut total = 0.0;
         for (number, (canvas, gradient)) in (first..).zip(canvas.iter_mut().zip(gradient)) {
-            let sums = std::mem::replace(&mut canvas.planes[DEPTH], ZERO_PLANE);
-            let planes = &mut canvas.planes;
-            (planes[SQUARE], planes[BY_ALPHA]) = (ZERO_PLANE, ZERO_PLANE);
-            let by_depth = &mut gradient.planes[BY_DEPTH];
-            *by_depth = ZERO_PLANE;
-            TilePlace::new(grid, number).for_each_pixel(grid.width, |patch, lane, pixel| {
-                let transmittance = planes[TRANSMITTANCE][patch][lane];
-                let found = loss.at_pixel(pixel, transmittance, sums[patch][lane]);
-                planes[CENTRE][patch][lane] = found.centre;
-                planes[SQUARE][patch][lane] = found.square;
-                planes[BY_ALPHA][patch][lane] = found.by_alpha;
-                by_depth[patch][lane] = found.by_depth;
-                total += f64::from(found.value);
-            });
+            let given = GivenTile::new(&loss, &TilePlace::new(grid, number));
+            let mut values = [0.0; WIDTH];
+            for (p, by_depth) in gradient.planes[BY_DEPTH].iter_mut().enumerate() {
+                for lane in 0..WIDTH {
+                    let [inverse, confidence] = [given.inverse[p][lane], given.confidence[p][lane]];
+                    let transmittance = canvas.planes[TRANSMITTANCE][p][lane];
+                    let sum = canvas.planes[DEPTH][p][lane];
+                    let mask = given.mask[p][lane];
+                    let found = loss.at_pixel([inverse, confidence, mask], transmittance, sum);
+                    values[lane] += found.value;
+                    by_depth[lane] = found.by_depth;
+                    canvas.planes[CENTRE][p][lane] = found.centre;
+                    canvas.planes[SQUARE][p][lane] = found.square;
+                    canvas.planes[BY_ALPHA][p][lane] = found.by_alpha;
+                }
+            }
+            total += values.iter().map(|&value| f64::from(value)).sum::<f64>();
         }
         total
+    }
+}
+
+/// The given depth in a tile's pixels; 0 outside the image.
+pub(super) struct GivenTile {
+    /// The given inverse depth; 0 where none is given `[1/scene units]`.
+    pub(super) inverse: Plane,
+    /// Confidence times mask.
+    confidence: Plane,
+    mask: Plane,
+}
+
+impl GivenTile {
+    #[inline(always)]
+    pub(super) fn new(loss: &DepthLoss<'_>, place: &TilePlace) -> Self {
+        let mut given = Self { inverse: ZERO_PLANE, confidence: ZERO_PLANE, mask: ZERO_PLANE };
+        for y in 0..place.height {
+            let first = (place.y as usize + y) * loss.width + place.x as usize;
+            let [mut inverse, mut confidence, mut mask] = [[0.0; TILE]; 3];
+            for x in 0..place.width {
+                [inverse[x], confidence[x], mask[x]] = loss.given(first + x);
+            }
+            set_row_of_plane(&mut given.inverse, y, &inverse);
+            set_row_of_plane(&mut given.confidence, y, &confidence);
+            set_row_of_plane(&mut given.mask, y, &mask);
+        }
+        given
     }
 }

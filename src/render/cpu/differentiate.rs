@@ -1,6 +1,6 @@
 //! Gradients and losses outside of training; see [`Differentiable`].
 
-use super::depth_gradient::{BY_ALPHA, CENTRE, DepthChannel, SQUARE};
+use super::depth_channel::{BY_ALPHA, CENTRE, DepthChannel, SQUARE};
 use super::loss::ErrorRequests;
 use super::optimise::Differentiate;
 use super::rasterize::{DepthPlane, ZERO_PLANE};

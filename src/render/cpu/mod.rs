@@ -13,6 +13,7 @@ mod batch;
 mod blocks;
 mod budget;
 mod candidates;
+mod depth_channel;
 mod depth_gradient;
 mod differentiate;
 mod exposure;
@@ -65,7 +66,6 @@ use densify_core::budget::RowBudget;
 use densify_core::camera::Camera;
 use densify_core::gaussians::{Gaussians, ModelArray};
 use densify_core::memory::Ledger;
-use depth_gradient::DepthChannel;
 use loss::{ErrorRequests, LossBuffers};
 use mask::Masks;
 use moments::Moments;
@@ -219,8 +219,7 @@ impl CpuBackend {
     fn step(&mut self, input: &StepInput<'_>) -> Result<StepOutput, BackendError> {
         let StepInput { camera, target, background, exposure, .. } = *input;
         let unexposed = exposure.map_or(background, |exposure| exposure.behind(background));
-        let depth = self.depth_loss(input);
-        let plane = depth.map_or(DepthPlane::Unused, DepthPlane::of_loss);
+        let (depth, plane) = self.depth_loss(input);
         let frame = self.forward(camera, unexposed, input.sh_degree, plane, None)?;
         if let Some(exposure) = exposure {
             self.expose(&frame.grid, exposure);
@@ -236,15 +235,7 @@ impl CpuBackend {
             let photograph = Photograph { target, background, exposure };
             self.collect_candidates(&frame, photograph, &request, count);
         }
-        let (mut layout, mut channel) = (self.signals.layout(), DepthChannel::DEPTH);
-        let mut depth_value = None;
-        if let Some(depth) = depth {
-            channel = DepthChannel::of_loss(depth.term);
-            depth_value = self.depth_gradient(&frame.grid, depth);
-        } else {
-            layout = layout.without_depth();
-        }
-        self.backward(&frame, layout, channel);
+        let (layout, depth) = self.backward_with_depth(&frame, depth);
         self.optimise(&frame, input, layout);
         self.clock.lap("project_bwd + adam");
         Ok(StepOutput {
@@ -252,7 +243,7 @@ impl CpuBackend {
             entries: frame.entries,
             bands: frame.bands.len() as u32,
             exposure: exposure_gradient,
-            depth: depth_value,
+            depth,
             ..scalars(value)
         })
     }

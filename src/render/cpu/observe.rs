@@ -17,8 +17,7 @@ use super::project::Splat;
 use super::rasterize::{
     ALPHA_MAX, Blending, DepthPlane, PATCHES, Plane, TRANSMITTANCE, TilePlace, ZERO_PLANE,
 };
-use super::rasterize_bwd::gather_all;
-use super::records::{Sums, TileRecords, parts};
+use super::records::{Sums, TileRecords, gather_all, parts};
 use super::simd::{V, WIDTH};
 use super::tiles::{Entry, Grid, Visible};
 use super::{AuxInput, AuxOutput, BackendError, CpuBackend};

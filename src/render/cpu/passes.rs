@@ -11,7 +11,8 @@ use rayon::prelude::*;
 use super::batch::Batch;
 use super::blocks::parts;
 use super::candidates;
-use super::depth_gradient::DepthChannel;
+use super::depth_channel::DepthChannel;
+use super::depth_gradient::GivenTile;
 use super::loss::{ErrorRequests, LossValue};
 use super::optimise::Optimise;
 use super::project::{Project, ViewParams};
@@ -19,8 +20,8 @@ use super::rasterize::{
     Blending, CANVAS_PLANES, DEPTH, DepthPlane, Rasterize, TRANSMITTANCE, TileCanvas, TilePlace,
     ZERO_PLANE, in_plane,
 };
-use super::rasterize_bwd::{RasterizeBwd, TileGradient, gather};
-use super::records::{Sums, parts as parts_of_records};
+use super::rasterize_bwd::{RasterizeBwd, TileGradient};
+use super::records::{Sums, gather, parts as parts_of_records};
 use super::regularise::{Noise, Terms};
 use super::simd::WIDTH;
 use super::tiles::{Grid, TILE, Visible};
@@ -139,12 +140,18 @@ impl CpuBackend {
                 let scratch = || (Vec::new(), Batch::new());
                 threads.each_with("rasterize", tiles, scratch, |(sorting, batch), (i, canvas)| {
                     lists.sort(i, sorting);
+                    let place = TilePlace::new(&grid, band.start + i);
+                    let given = match &depth_plane {
+                        DepthPlane::Distance(loss) => Some(GivenTile::new(loss, &place).inverse),
+                        _ => None,
+                    };
                     arch.dispatch(Rasterize {
                         splats,
                         list: lists.of_tile(i),
-                        place: TilePlace::new(&grid, band.start + i),
+                        place,
                         background,
                         depth_plane,
+                        given: given.as_ref(),
                         dominant,
                         blending,
                         canvas,

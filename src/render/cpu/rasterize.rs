@@ -55,20 +55,6 @@ pub(super) enum DepthPlane<'a> {
     Distance(DepthLoss<'a>),
 }
 
-impl DepthPlane<'_> {
-    /// The inverse depth given in each pixel of a tile, from which distances are taken; 0 where there is none.
-    fn given(self, place: &TilePlace) -> Plane {
-        let mut plane = ZERO_PLANE;
-        if let Self::Distance(loss) = self {
-            place.for_each_pixel(loss.width, |patch, lane, pixel| {
-                let [inverse, confidence] = loss.given(pixel);
-                plane[patch][lane] = if confidence > 0.0 { inverse } else { 0.0 };
-            });
-        }
-        plane
-    }
-}
-
 /// Planes of a rendered tile: red, green, blue, final transmittance, depth. Before the backward pass of a step with
 /// depth in its loss, [`depth_gradient`](super::depth_gradient) replaces all but the transmittance.
 pub(super) const CANVAS_PLANES: usize = 5;
@@ -188,6 +174,8 @@ pub(super) struct Rasterize<'a> {
     pub(super) place: TilePlace,
     pub(super) background: [f32; 3],
     pub(super) depth_plane: DepthPlane<'a>,
+    /// Inverse depths from which [distances](DepthPlane::Distance) are taken; 0 where none is given.
+    pub(super) given: Option<&'a Plane>,
     /// The number of pixels in which each row has the largest blend weight, to which the tile adds its pixels; empty
     /// if they are not counted. The counts are integers, so that the order of tiles does not matter.
     pub(super) dominant: &'a [AtomicU32],
@@ -202,29 +190,41 @@ impl WithSimd for Rasterize<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, s: S) {
-        // Halves or quarters of a patch are processed in pairs, so that common values are loaded once. Depth and
-        // dominant pixels, which are rarely needed, share one kernel.
-        let is_unused = matches!(self.depth_plane, DepthPlane::Unused);
-        let with_extras = !is_unused || !self.dominant.is_empty();
-        match (with_extras, matches!(S::F32_LANES, 4 | 8)) {
-            (true, true) => self.blend::<S, true, 2>(s),
-            (true, false) => self.blend::<S, true, 1>(s),
-            (false, true) => self.blend::<S, false, 2>(s),
-            (false, false) => self.blend::<S, false, 1>(s),
+        // Halves or quarters of a patch are processed in pairs, so that common values are loaded once.
+        if const { matches!(S::F32_LANES, 4 | 8) } {
+            self.blend_by::<S, 2>(s);
+        } else {
+            self.blend_by::<S, 1>(s);
         }
     }
 }
 
+/// What [`Rasterize::blend`] accumulates besides colour. Dominant pixels, which are rarely needed, come with depth.
+const COLOUR: u8 = 0;
+const WITH_DEPTH: u8 = 1;
+const WITH_DOMINANT: u8 = 2;
+
 impl Rasterize<'_> {
+    #[inline(always)]
+    fn blend_by<S: Simd, const N: usize>(self, s: S) {
+        if !self.dominant.is_empty() {
+            self.blend::<S, WITH_DOMINANT, N>(s);
+        } else if matches!(self.depth_plane, DepthPlane::Unused) {
+            self.blend::<S, COLOUR, N>(s);
+        } else {
+            self.blend::<S, WITH_DEPTH, N>(s);
+        }
+    }
+
     /// Blends the list into the tile, `N` vectors of a patch at a time.
     #[inline(always)]
     #[expect(clippy::too_many_lines, reason = "a numeric kernel")]
-    fn blend<S: Simd, const WITH_EXTRAS: bool, const N: usize>(self, s: S) {
+    fn blend<S: Simd, const WITH: u8, const N: usize>(self, s: S) {
         let Self { splats, list, place, background, dominant, canvas, blending, batch, .. } = self;
         let counts = matches!(self.depth_plane, DepthPlane::BlendedCount);
         let is_inverse = matches!(self.depth_plane, DepthPlane::Inverse | DepthPlane::Distance(_));
         // Differences from the given depth are added as they are, or as distances.
-        let given = if WITH_EXTRAS { self.depth_plane.given(&place) } else { ZERO_PLANE };
+        let given = self.given.unwrap_or(const { &ZERO_PLANE });
         let sign = if matches!(self.depth_plane, DepthPlane::Distance(_)) { -1.0 } else { 1.0 };
         let c = |x: f32| V::splat(s, x);
         let (e_min, t_min) = (c(-blending.log2_reach), c(blending.transmittance_min));
@@ -250,7 +250,7 @@ impl Rasterize<'_> {
                 break;
             }
             batch.set(s, splats, chunk, &place);
-            if WITH_EXTRAS && is_inverse {
+            if WITH != COLOUR && is_inverse {
                 for splat in &mut batch.splats[..chunk.len()] {
                     splat.depth = 1.0 / splat.depth;
                 }
@@ -319,13 +319,15 @@ impl Rasterize<'_> {
                             r[n] = w.mul_add(c(splat.colour[0]), r[n]);
                             g[n] = w.mul_add(c(splat.colour[1]), g[n]);
                             b[n] = w.mul_add(c(splat.colour[2]), b[n]);
-                            if WITH_EXTRAS {
+                            if WITH != COLOUR {
                                 at_depth[n] = if counts {
                                     at_depth[n] + zero.lt(w).keep(c(1.0))
                                 } else {
                                     let difference = c(splat.depth) - given[n];
                                     w.mul_add(difference.max(difference * sign), at_depth[n])
                                 };
+                            }
+                            if WITH == WITH_DOMINANT {
                                 let here = s.splat_u32s(first + i as u32);
                                 let largest_at = &mut largest_at[p][at + n * S::F32_LANES..];
                                 let largest_at = &mut S::as_mut_simd_u32s(largest_at).0[0];
@@ -339,8 +341,10 @@ impl Rasterize<'_> {
                     store_of(r, &mut red[p][at..]);
                     store_of(g, &mut green[p][at..]);
                     store_of(b, &mut blue[p][at..]);
-                    if WITH_EXTRAS {
+                    if WITH != COLOUR {
                         store_of(at_depth, &mut depth[p][at..]);
+                    }
+                    if WITH == WITH_DOMINANT {
                         store_of(w_max, &mut largest.0[p][at..]);
                     }
                     for t in t {
@@ -361,7 +365,7 @@ impl Rasterize<'_> {
                 add_product(s, t, c(background[2]), &mut blue[p][at..]);
             }
         }
-        if WITH_EXTRAS && !dominant.is_empty() {
+        if WITH == WITH_DOMINANT {
             let pixels = largest.0.as_flattened().iter().zip(largest_at.as_flattened());
             for (_, &at) in pixels.filter(|(weight, _)| **weight > 0.0) {
                 let row = Entry::load(&list[at as usize]).row;

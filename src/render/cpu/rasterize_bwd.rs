@@ -16,24 +16,25 @@
 //! covariance's gradient is ½·L·M·Lᵀ with M the matrix of second moments; it is never formed, see `project_bwd`.
 //!
 //! Depth is one more channel. The value of a splat with (inverse) depth x in a pixel is m·ρ(x − c) + n·(x − c)², where
-//! ρ is the identity or, with another sign for negative arguments, the absolute value; see [`depth_gradient`]. Nothing
+//! ρ is the identity or the absolute value; see
+//! [`depth_gradient`](super::depth_gradient). Nothing
 //! is behind the last splat, so this channel adds nothing to the first b. A gradient with respect to alpha has the same
 //! value for every splat, so it is subtracted from the first b instead.
 //!
 //! Records are summed per row in order of tile number, so that the sum does not depend on the number of threads.
 
-use std::sync::atomic::{AtomicU32, AtomicU64, Ordering::Relaxed};
+use std::sync::atomic::AtomicU64;
 
 use bytemuck::Zeroable;
 use pulp::{Simd, WithSimd};
 
 use super::batch::{BATCH, Batch};
-use super::depth_gradient::{self, DepthChannel};
+use super::depth_channel::{BY_ALPHA, CENTRE, DepthChannel, SQUARE};
 use super::project::Splat;
 use super::rasterize::{
     ALPHA_MAX, Aligned, Blending, PATCHES, Plane, TRANSMITTANCE, TileCanvas, TilePlace, ZERO_PLANE,
 };
-use super::records::TileRecords;
+use super::records::{TileRecords, write};
 use super::simd::{V, WIDTH, each, sums_of_four};
 use super::tiles::Entry;
 use crate::signals::{BASE, Field, RecordLayout};
@@ -60,8 +61,13 @@ mod extra {
     /// The sum of the weighted error, together with [`WEIGHTS`] and [`LARGEST`].
     pub(super) const ERROR: u8 = 8 | WEIGHTS | LARGEST;
     pub(super) const ERROR_ABS: u8 = ERROR | ABS;
-    /// Everything, with the channel of depth.
-    pub(super) const ALL: u8 = 16 | ERROR_ABS;
+    /// The channel of depth without squares.
+    pub(super) const DEPTH: u8 = 16;
+    /// This channel, with the value that most policies need.
+    pub(super) const DEPTH_LARGEST: u8 = DEPTH | LARGEST;
+    /// The squares of the channel of depth.
+    pub(super) const SQUARES: u8 = 32 | DEPTH;
+    pub(super) const ALL: u8 = SQUARES | ERROR_ABS;
 }
 
 /// dL/dpixel of one tile: red, green, blue, depth; and the error of the pixels. The fourth plane is only read for
@@ -103,7 +109,7 @@ impl WithSimd for RasterizeBwd<'_> {
     #[inline(always)]
     fn with_simd<S: Simd>(self, s: S) {
         let has = |field| self.layout.has(field);
-        // For the scalar instruction set only two kernels are compiled: all eleven, unrolled lane by lane, would be a
+        // For the scalar instruction set only two kernels are compiled: all twelve, unrolled lane by lane, would be a
         // tenth of the program. Values that are not requested are computed, but not written.
         if const { S::F32_LANES == 1 } {
             if has(Field::Depth) {
@@ -127,7 +133,7 @@ impl WithSimd for RasterizeBwd<'_> {
             extras |= extra::ERROR;
         }
         if has(Field::Depth) {
-            extras = extra::ALL;
+            extras |= if self.depth.has_squares { extra::SQUARES } else { extra::DEPTH };
         }
         match extras {
             0 => self.backpropagate::<S, 0>(s),
@@ -140,6 +146,9 @@ impl WithSimd for RasterizeBwd<'_> {
             7 => self.backpropagate::<S, 7>(s),
             extra::ERROR => self.backpropagate::<S, { extra::ERROR }>(s),
             extra::ERROR_ABS => self.backpropagate::<S, { extra::ERROR_ABS }>(s),
+            extra::DEPTH | extra::DEPTH_LARGEST => {
+                self.backpropagate::<S, { extra::DEPTH_LARGEST }>(s);
+            }
             _ => self.backpropagate::<S, { extra::ALL }>(s),
         }
     }
@@ -232,8 +241,7 @@ impl RasterizeBwd<'_> {
         let c = |x: f32| V::splat(s, x);
         let [gr, gg, gb, by_depth, errors] = &upstream.planes;
         let [centre, square, by_alpha] =
-            [depth_gradient::CENTRE, depth_gradient::SQUARE, depth_gradient::BY_ALPHA]
-                .map(|plane| &canvas.planes[plane]);
+            [CENTRE, SQUARE, BY_ALPHA].map(|plane| &canvas.planes[plane]);
 
         // State per pixel behind the current splat.
         let mut transmittance = Aligned(canvas.planes[TRANSMITTANCE]);
@@ -246,7 +254,8 @@ impl RasterizeBwd<'_> {
                 let b = V::load(s, &gr[p][at..]) * background[0]
                     + V::load(s, &gg[p][at..]) * background[1]
                     + V::load(s, &gb[p][at..]) * background[2];
-                let b = if EXTRAS == extra::ALL { b - V::load(s, &by_alpha[p][at..]) } else { b };
+                let has_depth = EXTRAS & extra::DEPTH != 0;
+                let b = if has_depth { b - V::load(s, &by_alpha[p][at..]) } else { b };
                 b.store(&mut behind[p][at..]);
             }
             *end = canvas.stop[p].iter().copied().max().unwrap_or(0).min(list.len() as u32);
@@ -298,18 +307,22 @@ impl RasterizeBwd<'_> {
                             V::load(s, &gb[p][at..]),
                         );
                         let mut cg = colour[0].mul_add(r, colour[1].mul_add(g, colour[2] * b));
-                        if EXTRAS >= extra::ERROR {
+                        if EXTRAS & extra::ERROR == extra::ERROR {
                             let error = V::load(s, &errors[p][at..]);
                             sums.error = w.mul_add(error, sums.error);
                         }
-                        if EXTRAS == extra::ALL {
+                        if EXTRAS & extra::DEPTH != 0 {
                             let x = at_depth - V::load(s, &centre[p][at..]);
                             let m = V::load(s, &by_depth[p][at..]);
-                            let slope = x.lt(zero).select(m * depth.sign, m);
-                            let n = V::load(s, &square[p][at..]);
-                            let chord = n.mul_add(x, slope);
+                            let slope = m.with_sign_of(x, depth.sign_bit);
+                            let (mut chord, mut tangent) = (slope, slope);
+                            if EXTRAS & extra::SQUARES == extra::SQUARES {
+                                let n = V::load(s, &square[p][at..]);
+                                chord = n.mul_add(x, slope);
+                                tangent = n.mul_add(x, chord);
+                            }
                             cg = x.mul_add(chord, cg);
-                            sums.by_depth = w.mul_add(n.mul_add(x, chord), sums.by_depth);
+                            sums.by_depth = w.mul_add(tangent, sums.by_depth);
                         }
                         let old_b = V::load(s, &behind[p][at..]);
                         let cg_minus_b = cg - old_b;
@@ -355,10 +368,10 @@ impl RasterizeBwd<'_> {
                     record[Field::WeightSum.number()] = sums.weight.sum();
                     record[Field::PixelCount.number()] = sums.pixels.sum();
                 }
-                if EXTRAS >= extra::ERROR {
+                if EXTRAS & extra::ERROR == extra::ERROR {
                     record[Field::Error.number()] = sums.error.sum();
                 }
-                if EXTRAS == extra::ALL {
+                if EXTRAS & extra::DEPTH != 0 {
                     record[Field::Depth.number()] =
                         sums.by_depth.sum() * depth.derivative(splat.depth);
                 }
@@ -370,50 +383,3 @@ impl RasterizeBwd<'_> {
         }
     }
 }
-
-/// Writes the values that the layout has.
-#[inline(always)]
-fn write(to: Option<&[AtomicU32]>, all: &[f32; RecordLayout::MOST], layout: RecordLayout) {
-    let Some((base, extras)) = to.and_then(|to| to.split_at_checked(BASE)) else { return };
-    for (to, x) in base.iter().zip(all) {
-        to.store(x.to_bits(), Relaxed);
-    }
-    for (to, &number) in extras.iter().zip(layout.extras()) {
-        to.store(all[usize::from(number)].to_bits(), Relaxed);
-    }
-}
-
-/// Adds up the records of one row, which are adjacent, in order. `sums` has the shape of a record.
-pub(super) fn gather(sums: &mut [f32], layout: RecordLayout, records: &[AtomicU32]) {
-    let maximum = layout.has(Field::WeightMax);
-    match sums.len() {
-        9 => gather_all::<9>(sums, maximum, records),
-        10 => gather_all::<10>(sums, maximum, records),
-        11 => gather_all::<11>(sums, maximum, records),
-        12 => gather_all::<12>(sums, maximum, records),
-        13 => gather_all::<13>(sums, maximum, records),
-        14 => gather_all::<14>(sums, maximum, records),
-        15 => gather_all::<15>(sums, maximum, records),
-        _ => gather_all::<{ RecordLayout::MOST }>(sums, maximum, records),
-    }
-}
-
-/// Adds records of `STRIDE` values to `sums`; the last value may be a maximum.
-#[inline(always)]
-pub(super) fn gather_all<const STRIDE: usize>(
-    sums: &mut [f32],
-    maximum: bool,
-    records: &[AtomicU32],
-) {
-    let mut total: [f32; STRIDE] = std::array::from_fn(|i| sums[i]);
-    for record in records.as_chunks::<STRIDE>().0 {
-        for i in 0..STRIDE {
-            let x = f32::from_bits(record[i].load(Relaxed));
-            let is_maximum = maximum && i == STRIDE - 1;
-            total[i] = if is_maximum { total[i].max(x) } else { total[i] + x };
-        }
-    }
-    sums.copy_from_slice(&total);
-}
-
-const _: () = assert!(BASE == 9 && RecordLayout::MOST == 16, "`gather` lists every length");

@@ -8,7 +8,7 @@
 //! in order of tile number, so that parts, like bands, cost time but do not change the result.
 
 use std::ops::Range;
-use std::sync::atomic::AtomicU32;
+use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
 
 use rayon::prelude::*;
 
@@ -16,6 +16,7 @@ use super::simd::WIDTH;
 use super::threads::Threads;
 use super::tiles::{Entry, TileLists};
 use super::{BLOCKS_PER_TASK, ROWS_PER_TASK};
+use crate::signals::{BASE, Field, RecordLayout};
 
 /// Entries of a band whose records are in memory at the same time.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -148,3 +149,54 @@ impl Part {
         });
     }
 }
+
+/// Writes the values that the layout has.
+#[inline(always)]
+pub(super) fn write(
+    to: Option<&[AtomicU32]>,
+    all: &[f32; RecordLayout::MOST],
+    layout: RecordLayout,
+) {
+    let Some((base, extras)) = to.and_then(|to| to.split_at_checked(BASE)) else { return };
+    for (to, x) in base.iter().zip(all) {
+        to.store(x.to_bits(), Relaxed);
+    }
+    for (to, &number) in extras.iter().zip(layout.extras()) {
+        to.store(all[usize::from(number)].to_bits(), Relaxed);
+    }
+}
+
+/// Adds up the records of one row, which are adjacent, in order. `sums` has the shape of a record.
+pub(super) fn gather(sums: &mut [f32], layout: RecordLayout, records: &[AtomicU32]) {
+    let maximum = layout.has(Field::WeightMax);
+    match sums.len() {
+        9 => gather_all::<9>(sums, maximum, records),
+        10 => gather_all::<10>(sums, maximum, records),
+        11 => gather_all::<11>(sums, maximum, records),
+        12 => gather_all::<12>(sums, maximum, records),
+        13 => gather_all::<13>(sums, maximum, records),
+        14 => gather_all::<14>(sums, maximum, records),
+        15 => gather_all::<15>(sums, maximum, records),
+        _ => gather_all::<{ RecordLayout::MOST }>(sums, maximum, records),
+    }
+}
+
+/// Adds records of `STRIDE` values to `sums`; the last value may be a maximum.
+#[inline(always)]
+pub(super) fn gather_all<const STRIDE: usize>(
+    sums: &mut [f32],
+    maximum: bool,
+    records: &[AtomicU32],
+) {
+    let mut total: [f32; STRIDE] = std::array::from_fn(|i| sums[i]);
+    for record in records.as_chunks::<STRIDE>().0 {
+        for i in 0..STRIDE {
+            let x = f32::from_bits(record[i].load(Relaxed));
+            let is_maximum = maximum && i == STRIDE - 1;
+            total[i] = if is_maximum { total[i].max(x) } else { total[i] + x };
+        }
+    }
+    sums.copy_from_slice(&total);
+}
+
+const _: () = assert!(BASE == 9 && RecordLayout::MOST == 16, "`gather` lists every length");

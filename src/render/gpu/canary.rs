@@ -8,11 +8,15 @@ use glam::{DMat3, DVec3};
 use super::{GpuBackend, GpuDevice};
 use crate::cpu::CpuBackend;
 use crate::signals::RecordLayout;
-use crate::{Backend, BackendError, LearningRates, Setup, StepInput, StepOutput, Storage};
+use crate::{
+    Backend, BackendError, DepthTarget, DepthTerm, LearningRates, Setup, StepInput, StepOutput,
+    Storage,
+};
 use densify_core::antialiasing::Antialiasing;
 use densify_core::camera::Camera;
 use densify_core::gaussians::{Gaussians, sh_coefficients};
 use densify_core::image::Image8;
+use densify_core::image::depth::DepthMap;
 
 const ROWS: u32 = 60;
 const SIZE: u32 = 40;
@@ -60,11 +64,26 @@ fn scene() -> (Gaussians, Camera, Image8) {
     (model, camera, target)
 }
 
-/// Trains two steps and renders.
+/// Depth given in half of the pixels, in front of and behind the rows.
+fn given_depth(camera: &Camera) -> DepthMap {
+    let (width, height) = (camera.width, camera.height);
+    let confidence = |pixel: u32| if pixel.is_multiple_of(2) { 255 } else { 0 };
+    DepthMap {
+        width,
+        height,
+        inverse: (0..width * height).map(|pixel| 200 + (pixel * 37 % 600) as u16).collect(),
+        confidence: (0..width * height).map(confidence).collect(),
+        unit: 1e-3,
+        median: 2.0,
+    }
+}
+
+/// Trains two steps, with depth in the loss if a map is given, and renders.
 fn run(
     backend: &mut dyn Backend,
     camera: &Camera,
     target: &Image8,
+    map: Option<&DepthMap>,
 ) -> Result<(Vec<StepOutput>, Vec<f32>), BackendError> {
     let rates = LearningRates {
         mean: 5e-3,
@@ -84,8 +103,8 @@ fn run(
             target,
             background: BACKGROUND,
             exposure: None,
-            depth: None,
-            distortion: 0.0,
+            depth: map.map(|map| DepthTarget { map, weight: 1.0, term: DepthTerm::Samples }),
+            distortion: if map.is_some() { 1.0 } else { 0.0 },
             sh_degree: 1,
             rates,
             loss_terms: LossTerms::default(),
@@ -110,20 +129,25 @@ impl GpuBackend {
         options: &Setup,
         device: &GpuDevice,
     ) -> Result<Self, BackendError> {
-        device.run_canary(&options.needs, options.storage)?;
+        device.run_canary(&options.needs, options.storage, options.depth)?;
         Self::without_canary(model, options, device)
     }
 }
 
 impl GpuDevice {
-    /// Compares the device with the native backend, once per set of kernels that a policy's needs and the storage of
-    /// numbers require. Afterwards the memory of the process includes the driver's.
+    /// Compares the device with the native backend, once per set of kernels that a policy's needs, the storage of numbers
+    /// and depth in the loss require. Afterwards the memory of the process includes the driver's.
     ///
     /// # Errors
     /// As [`GpuBackend::new`].
-    pub fn run_canary(&self, needs: &Needs, storage: Storage) -> Result<(), BackendError> {
-        let kernels = (RecordLayout::new(needs.signals, false), storage);
-        self.0.check_once(kernels, || check(self, needs, storage))
+    pub fn run_canary(
+        &self,
+        needs: &Needs,
+        storage: Storage,
+        depth: bool,
+    ) -> Result<(), BackendError> {
+        let kernels = (RecordLayout::new(needs.signals, depth), storage);
+        self.0.check_once(kernels, || check(self, needs, storage, depth))
     }
 }
 
@@ -131,29 +155,40 @@ impl GpuDevice {
 ///
 /// # Errors
 /// [`BackendError::Device`] with the difference.
-fn check(device: &GpuDevice, needs: &Needs, storage: Storage) -> Result<(), BackendError> {
+fn check(
+    device: &GpuDevice,
+    needs: &Needs,
+    storage: Storage,
+    depth: bool,
+) -> Result<(), BackendError> {
     let (model, camera, target) = scene();
-    let mut options = Setup { threads: Some(1), storage, ..Setup::new(model.len()) };
+    let mut options = Setup { threads: Some(1), storage, depth, ..Setup::new(model.len()) };
     let mut cpu = CpuBackend::new(&model, &options)?;
     options.largest_image = (camera.width, camera.height);
     options.needs.signals = needs.signals;
     let mut gpu = GpuBackend::without_canary(&model, &options, device)?;
-    let (expected, image) = run(&mut cpu, &camera, &target)?;
-    let (found, rendered) = run(&mut gpu, &camera, &target)?;
+    let map = depth.then(|| given_depth(&camera));
+    let (expected, image) = run(&mut cpu, &camera, &target, map.as_ref())?;
+    let (found, rendered) = run(&mut gpu, &camera, &target, map.as_ref())?;
     let wrong = |difference: String| BackendError::Device {
         device: device.adapter().name.clone(),
         why: format!("its driver computes wrongly: {difference}"),
     };
     for (step, (found, expected)) in found.iter().zip(&expected).enumerate() {
         // `<=`, so that NaN counts as a difference.
-        let is_close = (found.loss - expected.loss).abs() <= LOSS_TOLERANCE;
+        let depths = [found, expected].map(|output| output.depth.unwrap_or_default());
+        let is_close = (found.loss - expected.loss).abs() <= LOSS_TOLERANCE
+            && (depths[0] - depths[1]).abs() <= LOSS_TOLERANCE;
         if !is_close || found.visible != expected.visible {
             return Err(wrong(format!(
-                "at step {} of a test scene, loss {} with {} rows on screen instead of {} with {}",
+                "at step {} of a test scene, loss {} and {} with {} rows on screen instead of {} and {} \
+                 with {}",
                 step + 1,
                 found.loss,
+                depths[0],
                 found.visible,
                 expected.loss,
+                depths[1],
                 expected.visible
             )));
         }
@@ -177,7 +212,7 @@ mod tests {
         let (model, camera, target) = scene();
         let options = Setup { threads: Some(1), ..Setup::new(model.len()) };
         let mut cpu = CpuBackend::new(&model, &options).unwrap();
-        let (outputs, _) = run(&mut cpu, &camera, &target).unwrap();
+        let (outputs, _) = run(&mut cpu, &camera, &target, None).unwrap();
         // Visible and invisible rows, several tiles, and steps whose effect exceeds the tolerance.
         assert!(outputs[0].visible > 30 && outputs[0].visible < model.len(), "{outputs:?}");
         assert!(outputs[0].entries > 100, "{outputs:?}");

@@ -64,9 +64,9 @@ impl GpuDevice {
         self.0.summary.largest_budget(sh_degree)
     }
 
-    /// Largest number of (row, tile) pairs in memory at a time, for a policy's needs.
-    pub fn max_pairs(&self, needs: &Needs) -> u64 {
-        memory_plan::max_pairs(&self.0, needs)
+    /// Largest number of (row, tile) pairs in memory at a time, for a policy's needs; `depth` as in [`Setup::depth`].
+    pub fn max_pairs(&self, needs: &Needs, depth: bool) -> u64 {
+        memory_plan::max_pairs(&self.0, needs, depth)
     }
 
     /// Memory of a backend with these options for models of this SH degree. Nothing is allocated.

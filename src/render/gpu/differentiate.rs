@@ -13,21 +13,24 @@ use densify_core::gaussians::{ModelArray, sh_coefficients};
 use densify_core::image::Image8;
 use densify_core::sh;
 
+/// The records of which gradients are read.
+const LAYOUT: RecordLayout = RecordLayout::DIFFERENTIATED;
+const STRIDE: usize = LAYOUT.stride();
+
 impl GpuBackend {
     /// Reads the gradients that stages 5 and 6 have left; see `shaders/shared/record.wgsl`.
     fn model_gradient(&self, frame: &Frame) -> Result<ModelGradient, BackendError> {
         let (n, degree) = (self.rows as u64, frame.model[1] as u8);
         let gradient = self.read("splats", 0, (4 * SPLAT) as u64 * n)?;
-        let sums = self.read("row sums", 0, 4 * RecordLayout::MOST as u64 * n)?;
+        let sums = self.read("row sums", 0, 4 * STRIDE as u64 * n)?;
         let means = ModelArray::Means.parameters(self.sizes.sh_degree);
         let means = self.parameters_of(&means, 0..self.rows)?;
         let planes = 3 * sh_coefficients(self.sizes.sh_degree);
         let mut out = ModelGradient { sh: vec![0.0; planes * self.rows], ..Default::default() };
         let rows = gradient.as_chunks::<SPLAT>().0.iter().zip(means.as_chunks::<3>().0);
-        let sums = sums.as_chunks::<{ RecordLayout::MOST }>().0;
-        for (row, ((g, mean), sums)) in rows.zip(sums).enumerate() {
+        for (row, ((g, mean), sums)) in rows.zip(sums.as_chunks::<STRIDE>().0).enumerate() {
             let seen = g[DEPTH] > 0.0;
-            let sums = if seen { *sums } else { [0.0; RecordLayout::MOST] };
+            let sums = if seen { *sums } else { [0.0; STRIDE] };
             let [quat_z, logit, x, y, unclamped, l1, ..] = sums;
             let unscale = 1.0 / EXPONENT_SCALE;
             out.means.push([g[0], g[1], g[2]]);
@@ -35,7 +38,7 @@ impl GpuBackend {
             out.quats.push([g[6], g[7], g[8], quat_z]);
             out.opacity_logits.push(logit);
             out.mean2d.push([x, y]);
-            let sum = |field: Field| sums[field.number()];
+            let sum = |field| LAYOUT.at(field).map_or(0.0, |at| sums[at]);
             out.mean2d_abs.push([
                 l1 * unscale * unscale * sum(Field::AbsX),
                 unscale * unscale * sum(Field::AbsY),
@@ -71,7 +74,7 @@ impl Differentiable for GpuBackend {
         upstream.assert_size(camera);
         assert_eq!(self.sizes.budget.frozen, 0, "frozen rows have no gradients");
         if !self.sizes.alpha_and_depth {
-            (self.sizes.alpha_and_depth, self.sizes.records) = (true, RecordLayout::DIFFERENTIATED);
+            (self.sizes.alpha_and_depth, self.sizes.records) = (true, LAYOUT);
             self.rebuild()?;
         }
         self.fit_image(camera.width, camera.height)?;

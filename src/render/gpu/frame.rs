@@ -45,7 +45,8 @@ pub(super) struct State {
     pub(super) broken_off: u32,
     pub(super) l1: f32,
     pub(super) ssim: f32,
-    pub(super) spare_f: [f32; 2],
+    pub(super) depth: f32,
+    pub(super) spare_f: f32,
 }
 
 impl State {
@@ -83,13 +84,16 @@ pub(super) mod due {
 }
 
 /// Bits of `Frame::draw[3]`: planes that the target has, whether the error per pixel is written for candidates and for
-/// signals, and whether there is an exposure.
+/// signals, whether there is an exposure, and what `shaders/shared/view.wgsl` says about depth.
 pub(super) mod target {
     pub(in super::super) const HAS_ALPHA: u32 = 1;
     pub(in super::super) const HAS_MASK: u32 = 2;
     pub(in super::super) const WITH_ERROR: u32 = 4;
     pub(in super::super) const BY_PIXEL: u32 = 8;
     pub(in super::super) const EXPOSED: u32 = 16;
+    pub(in super::super) const INVERSE_DEPTH: u32 = 32;
+    pub(in super::super) const DEPTH_DISTANCES: u32 = 64;
+    pub(in super::super) const GIVEN_DEPTH: u32 = 128;
 }
 
 const _: () = assert!(Signal::ALL.len() <= 4 * 8, "`Frame::planes` has an element for each signal");

@@ -200,6 +200,8 @@ pub(super) fn rebound(sizes: &Sizes) -> HashMap<&'static str, Vec<Vec<Rebinding>
     // Without and with an exposure.
     let derivatives = ("derivatives", sizes.derivatives());
     let images = vec![vec![derivatives], vec![derivatives, ("canvas", "exposed")]];
+    // Borrows the sums of the loss, which has not begun.
+    let depth_sums = vec![vec![("depth sums", "tile sums")]];
     let keys_in = two(&|i| vec![("keys in", KEYS[i])]);
     HashMap::from([
         ("count_digits", keys_in.clone()),
@@ -218,6 +220,8 @@ pub(super) fn rebound(sizes: &Sizes) -> HashMap<&'static str, Vec<Vec<Rebinding>
         ("emit_entries", two(&|i| vec![("keys out", KEYS[0]), ("values out", emitted(i))])),
         ("similarity", images.clone()),
         ("pixel_gradient", images),
+        ("depth_gradient", depth_sums.clone()),
+        ("total_depth", depth_sums),
         ("rasterize_bwd", vec![vec![("pixel gradient", sizes.pixel_gradient())]]),
         ("adam_band", (0..4).map(|band| adam(1 + band)).collect()),
         ("adam_geometry", vec![adam(0)]),

@@ -11,11 +11,12 @@ use crate::cpu::MAX_SIDE;
 use crate::signals::RecordLayout;
 use densify_core::memory::{Ledger, Section};
 
-/// Largest number of (row, tile) pairs that this device can hold at a time, for a policy's needs.
-pub(super) fn max_pairs(device: &Device, needs: &Needs) -> u64 {
+/// Largest number of (row, tile) pairs that this device can hold at a time, for a policy's needs, with or without depth in
+/// the loss.
+pub(super) fn max_pairs(device: &Device, needs: &Needs, depth: bool) -> u64 {
     // Numbers per pair in the largest buffer that grows with the number of pairs: the records, or else the lists.
     let numbers = match device.accumulation {
-        Accumulation::Slots => RecordLayout::new(needs.signals, false).stride() as u64,
+        Accumulation::Slots => RecordLayout::new(needs.signals, depth).stride() as u64,
         Accumulation::SubgroupCas | Accumulation::SubgroupAtomics => 1,
     };
     let by_binding = device.largest_binding() / (4 * numbers);
@@ -30,13 +31,14 @@ pub(super) fn sizes(device: &Device, sh_degree: u8, options: &Setup) -> Sizes {
     let rows = budget.total as u64;
     let cap = match options.tile_cap {
         Some(cap) => cap as u64,
-        None => (16 * rows).min(max_pairs(device, &options.needs)),
+        None => (16 * rows).min(max_pairs(device, &options.needs, options.depth)),
     };
     let (width, height) = options.largest_image;
     let image = (width.clamp(1, MAX_SIDE), height.clamp(1, MAX_SIDE));
     // An adapter supports fewer rows than MAX_ENTRIES.
     let cap = cap.min(MAX_ENTRIES).max(rows);
-    let mut sizes = Sizes::new(budget, cap, sh_degree, image, &options.needs, device.accumulation);
+    let (needs, depth) = (&options.needs, options.depth);
+    let mut sizes = Sizes::new(budget, cap, sh_degree, image, needs, depth, device.accumulation);
     sizes.photographs = options.photographs;
     sizes.exposures = options.exposures;
     sizes.storage = options.storage;
@@ -56,6 +58,9 @@ pub(super) fn ledger(sizes: &Sizes, needs: &Needs) -> Ledger {
     if sizes.with_edges {
         // Luma, edges and their weights.
         ledger.add_to(Section::Policy, "edges of a photograph", 6 * pixels);
+    }
+    if sizes.depth {
+        ledger.add_to(Section::Images, "given depth to upload", 4 * pixels);
     }
     if let Some(request) = &needs.aux {
         let bytes = aux_bytes(request, pixels);

@@ -14,6 +14,7 @@ mod audit;
 mod buffers;
 mod canary;
 mod clock;
+mod depth;
 mod device;
 mod differentiate;
 mod edits;
@@ -218,10 +219,11 @@ fn launches(
     (shortcuts, antialiasing): (Shortcuts, Antialiasing),
     buffers: &Buffers,
 ) -> Result<Launches, BackendError> {
-    let &Sizes { records, alpha_and_depth, counts_dominant, .. } = sizes;
+    let &Sizes { records, alpha_and_depth, depth, counts_dominant, .. } = sizes;
     let variant = Variant {
         records,
         alpha_and_depth,
+        depth,
         shortcuts,
         formats: sizes.formats(),
         counts_dominant,

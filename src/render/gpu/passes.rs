@@ -250,6 +250,20 @@ impl<L> Passes<'_, L> {
         }
     }
 
+    /// Writes the given inverse depth from which the forward pass takes distances.
+    pub(super) fn place_depth(&self, to: &mut impl Record<L>, pixels: u32) {
+        to.run(self.launches.get("place_depth"), [0; 4], groups(pixels.into()) as u32);
+    }
+
+    /// Depth in the loss, with these numbers of `shaders/depth_gradient.wgsl`.
+    pub(super) fn depth_gradient(&self, to: &mut impl Record<L>, pixels: u32, numbers: [f32; 4]) {
+        let l = self.launches;
+        let immediates = numbers.map(f32::to_bits);
+        to.stage("depth_gradient");
+        to.run(l.get("depth_gradient"), immediates, groups(pixels.into()) as u32);
+        to.run(l.get("total_depth"), [0; 4], 1);
+    }
+
     /// Stage 5: sums the pixels' gradients per row.
     pub(super) fn backward(&self, to: &mut impl Record<L>) {
         let l = self.launches;

@@ -74,6 +74,8 @@ pub(super) struct Sizes {
     pub(super) with_edges: bool,
     /// True if photographs have exposures.
     pub(super) exposures: bool,
+    /// True if depth may be in the loss.
+    pub(super) depth: bool,
 }
 
 /// A buffer to allocate.
@@ -110,9 +112,10 @@ impl Sizes {
         sh_degree: u8,
         image: (u32, u32),
         needs: &Needs,
+        depth: bool,
         accumulation: Accumulation,
     ) -> Self {
-        let records = RecordLayout::new(needs.signals, false);
+        let records = RecordLayout::new(needs.signals, depth);
         Self {
             budget,
             cap,
@@ -131,6 +134,7 @@ impl Sizes {
             with_error: records.has(Field::Error)
                 && needs.candidates.is_some_and(|r| r.error != ErrorMode::Gradient),
             exposures: false,
+            depth,
         }
     }
 
@@ -257,12 +261,17 @@ impl Sizes {
         add(Section::Tiles, "tiles", "tile starts", 4 * (tiles + 1));
         add(Section::Tiles, "tiles", "tile counts", 4 * tiles);
         add(Section::Renderer, "image and image gradient", "canvas", 16 * pixels);
-        add(Section::Renderer, "image and image gradient", "finish", 8 * pixels);
+        // Followed by the channel of depth.
+        let finish = if self.depth { 16 } else { 8 };
+        add(Section::Renderer, "image and image gradient", "finish", finish * pixels);
         if self.alpha_and_depth {
             add(Section::Renderer, "image and image gradient", "pixel gradient", 32 * pixels);
         }
         if self.with_edges {
             add(Section::Renderer, "loss", "edges", 4 * pixels);
+        }
+        if self.depth {
+            add(Section::Images, "given depth on the device", "given depth", 4 * pixels);
         }
         let scratch = self.ranges().iter().map(|range| range.at + range.bytes).max();
         add(Section::Renderer, "sorts and loss", SCRATCH, scratch.unwrap_or(0));
@@ -369,7 +378,8 @@ mod tests {
         const ROWS: usize = 1_000_000;
         let bytes_per_row = |pairs: u64, storage, accumulation| {
             let cap = pairs * ROWS as u64;
-            let mut sizes = Sizes::new(ROWS.into(), cap, 3, (1600, 1000), &needs(), accumulation);
+            let mut sizes =
+                Sizes::new(ROWS.into(), cap, 3, (1600, 1000), &needs(), false, accumulation);
             assert_eq!((sizes.planes, sizes.records.stride()), (9, 10));
             sizes.storage = storage;
             sizes.ledger().on_device().div_ceil(ROWS as u64)

@@ -9,6 +9,7 @@ use super::observe::RenderedView;
 use super::passes::{Passes, Recorder};
 use super::{GpuBackend, Waiting};
 use crate::candidates::{Photograph, error_weights};
+use crate::depth::{DepthLoss, DepthTerm};
 use crate::pixel_map::edge_weights;
 use crate::signals::Field;
 use crate::{BackendError, StepInput, StepOutput, assert_same_size};
@@ -41,6 +42,7 @@ impl GpuBackend {
         let mut frame = self.frame(camera, background, input.sh_degree);
         frame.draw[3] = self.load_photograph(input.view, target);
         self.load_exposure(&mut frame, exposure);
+        let depth = self.load_depth(&mut frame, input);
         let trained = self.sizes.budget.trained(self.rows).max(1) as f32;
         frame.add_step(input, trained, due, &self.planes);
         if self.sizes.records.has(Field::Error) {
@@ -58,7 +60,17 @@ impl GpuBackend {
         frame.errors = [0.0, 0.0, by_difference, by_dissimilarity];
         // All passes up to dL/dpixel.
         let compare = |passes: &Passes<'_>, to: &mut Recorder<'_>| {
+            if depth.is_some_and(|depth| depth.term == DepthTerm::Samples) {
+                passes.place_depth(to, pixels);
+            }
             passes.forward(to);
+            // Before the loss, which replaces the image.
+            if let Some(DepthLoss { distortion, least_inverse, weight, by_transmittance, .. }) =
+                depth
+            {
+                let numbers = [distortion, least_inverse, weight, by_transmittance];
+                passes.depth_gradient(to, pixels, numbers);
+            }
             if exposure.is_some() {
                 passes.expose(to, pixels);
             }
@@ -101,6 +113,7 @@ impl GpuBackend {
             self.stage_times = vec![("device", start.elapsed())];
         }
         let exposure = exposure.map(|exposure| self.exposure_gradient(exposure, background));
-        Ok(StepOutput { exposure, ..state.output() })
+        let given = input.depth.map(|_| state.depth);
+        Ok(StepOutput { exposure, depth: given, ..state.output() })
     }
 }

@@ -190,7 +190,7 @@ impl<'a> Case<'a> {
         let resident = || (host.process.resident)().unwrap_or(0);
         let before = resident();
         // Kernels depend on the signals, not on the number of rows.
-        self.inputs.device.prove(&self.needs(MIN_ROWS)?, self.choices.knobs.storage)?;
+        self.inputs.device.prove(&self.needs(MIN_ROWS)?, self.choices.knobs.storage, false)?;
         Ok(resident().saturating_sub(before))
     }
 

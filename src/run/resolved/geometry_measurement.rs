@@ -42,7 +42,8 @@ impl GeometryMeasurement {
     pub(crate) fn for_rows(&self, rows: usize) -> Setup {
         let rows = rows.max(1);
         // Few views have more than three pairs per row; those that do are rendered in bands, with the same result.
-        let pairs = rows.saturating_mul(3).min(self.device.most_pairs(&self.setup.needs));
+        let pairs =
+            rows.saturating_mul(3).min(self.device.most_pairs(&self.setup.needs, self.setup.depth));
         let cap = self.setup.tile_cap.map_or(pairs, |cap| cap.min(pairs));
         Setup {
             budget: RowBudget { total: rows, ..self.setup.budget },

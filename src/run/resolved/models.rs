@@ -115,7 +115,8 @@ pub(super) fn first_bytes_on_device(
 /// The setup of the backend that measures the importance of this many rows.
 pub(crate) fn importance_setup(rows: usize, case: &Case<'_>, size: &RunSize) -> Setup {
     let needs = needs();
-    let pairs = rows.saturating_mul(PAIRS_PER_ROW).min(case.inputs.device.most_pairs(&needs));
+    let pairs =
+        rows.saturating_mul(PAIRS_PER_ROW).min(case.inputs.device.most_pairs(&needs, false));
     Setup {
         budget: rows.into(),
         tile_cap: Some(pairs.max(rows)),

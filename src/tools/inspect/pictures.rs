@@ -23,7 +23,7 @@ const COARSE_STEPS: f64 = 1000.0;
 pub struct Channels {
     /// Opacity, as `NAME.alpha.png`.
     pub alpha: bool,
-    /// [Depth](mean_depth) in 16 bits, as `NAME.depth.png`, and in f32, as `NAME.depth.npy`.
+    /// Mean depth in 16 bits, as `NAME.depth.png`, and in f32, as `NAME.depth.npy`.
     pub depth: bool,
 }
 
@@ -143,7 +143,7 @@ fn alpha(rendering: &Rendering) -> DynamicImage {
 
 /// Mean depth of each pixel, Σ α·T·z / Σ α·T, times `units`; 0 where the opacity Σ α·T is below one half. `eval`
 /// measures the same depth.
-pub fn mean_depth(rendering: &Rendering, units: f64) -> Vec<f32> {
+fn mean_depth(rendering: &Rendering, units: f64) -> Vec<f32> {
     let mean = |(&depth, &alpha): (&f32, &f32)| {
         if alpha < OPAQUE { 0.0 } else { (f64::from(depth) / f64::from(alpha) * units) as f32 }
     };

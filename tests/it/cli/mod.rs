@@ -11,6 +11,7 @@ mod cleaning;
 mod comparing;
 mod compressing;
 mod configuring;
+mod depth_maps;
 mod exporting;
 mod exposing;
 mod faults;

@@ -1,6 +1,6 @@
 //! Decides whether depth is used: whether there is any, and whether it passes the checks.
 //!
-//! Up to [`CHECKED`] views are read. Their depth must have more than one value and agree with the points that the views
+//! Some views are read. Their depth must have more than one value and agree with the points that the views
 //! see; an error in scale of less than a fifth is corrected. With [relative](DepthUnit::Relative) depth, every view is
 //! read, and its scale and offset are fitted to its points.
 
@@ -9,39 +9,19 @@ use std::sync::Arc;
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
-use super::super::normalise::{Normalisation, median};
+use super::super::normalise::Normalisation;
 use super::super::{LoadError, LoadOptions, Note, PointCloud, View};
-use super::agreement::{Agreement, Fault, SeenPoint, Verdict, seen_points};
+use super::check::check;
+use super::fit::fit_views;
 use super::points::{self, PointSet};
-use super::{DepthAlong, DepthChoice, DepthSource, From, Meaning};
+use super::{DepthChoice, DepthSource, From, Meaning};
 use crate::error::{DepthRemedy, LoadRemedy};
 use densify_core::numbers::grouped;
 
-/// Number of views, at equal intervals, whose depth is checked before training.
-const CHECKED: usize = 24;
-/// Error in scale that is ignored, and the one from which on depth is refused.
+/// Error in scale that is ignored.
 const SCALE_IGNORED: f64 = 0.02;
-const SCALE_REFUSED: f64 = 0.2;
 /// Spread of the scales of different views that is noted.
 const SPREAD_NOTED: f64 = 0.05;
-/// A relative map needs this many points; its scale must be within this range of multiples of the median.
-const FIT_POINTS: usize = 10;
-const FIT_SCALES: [f64; 2] = [0.2, 5.0];
-/// Repetitions of the fit, each with the pairs whose errors are at most this multiple of the median error.
-const FIT_ROUNDS: usize = 4;
-const FIT_WIDTH: f64 = 2.0;
-/// Units that files have, to be suggested instead of a wrong one `[world units]`.
-const USUAL_UNITS: [(f64, &str); 9] = [
-    (1.0, "1"),
-    (0.1, "0.1"),
-    (0.01, "0.01"),
-    (0.001, "0.001"),
-    (1e-4, "0.0001"),
-    (1e-6, "0.000001"),
-    (1.0 / 5000.0, "1/5000"),
-    (1.0 / 6553.5, "1/6553.5"),
-    (1.0 / 4000.0, "1/4000"),
-];
 
 /// The depth that a run uses, and the evidence for it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -156,7 +136,7 @@ pub(in super::super) fn decide(
     Ok(finding)
 }
 
-fn refused(problem: String, remedy: DepthRemedy) -> LoadError {
+pub(super) fn refused(problem: String, remedy: DepthRemedy) -> LoadError {
     LoadError::Remedied { problem, remedy: LoadRemedy::Depth(remedy) }
 }
 
@@ -236,222 +216,6 @@ fn prepare(
     }))
 }
 
-/// The result of reading some of the views.
-struct Checked {
-    /// Number of views that were read.
-    views: usize,
-    /// Those of them without any known depth.
-    empty: usize,
-    /// Share of pixels that count.
-    known: f64,
-    verdict: Option<Verdict>,
-}
-
-/// Reads the depth of some views and compares it with the points.
-fn check(scene: &Scene<'_>, along: &DepthAlong, source: DepthOrigin) -> Result<Checked, LoadError> {
-    let with: Vec<&View> = scene.train.iter().filter(|view| view.source.depth.is_some()).collect();
-    let mut agreement = Agreement::default();
-    let (mut views, mut empty, mut constant, mut counted, mut pixels) = (0, 0, 0, 0, 0);
-    for view in with.iter().step_by(with.len().div_ceil(CHECKED).max(1)) {
-        let Some(depth) = &view.source.depth else { continue };
-        let sampled = depth.sampled(&view.source)?;
-        let known = |x: &f32| *x > 0.0 && x.is_finite();
-        let mut values = sampled.inverse.iter().copied().filter(known);
-        let first = values.next();
-        let mut is_constant = |first: f32| values.all(|x| (x - first).abs() <= 1e-6 * first);
-        views += 1;
-        match first {
-            None => empty += 1,
-            Some(first) => {
-                constant += usize::from(source != DepthOrigin::Points && is_constant(first))
-            }
-        }
-        let counts = |(x, weight): &(&f32, &u8)| known(x) && **weight > 0;
-        counted += sampled.inverse.iter().zip(&sampled.confidence).filter(counts).count();
-        pixels += sampled.inverse.len();
-        // Edges do not count, here as in training: points lie on either side of them.
-        let inverse: Vec<f32> = { sampled.inverse.iter().zip(&sampled.confidence) }
-            .map(|(x, weight)| if *weight > 0 { *x } else { 0.0 })
-            .collect();
-        agreement.add(&view.camera, &seen(scene, view), &inverse);
-    }
-    let example = with.first().and_then(|view| view.source.depth.as_ref()?.path());
-    let example = example.map_or_else(String::new, |path| format!("{}: ", path.display()));
-    if empty == views {
-        let problem = format!(
-            "{example}no depth is known in any of {views} views: all values are 0 or not finite"
-        );
-        return Err(refused(problem, DepthRemedy::Repair));
-    }
-    if constant > 0 && constant + empty == views {
-        let problem = format!(
-            "{example}the depth maps of all {views} checked views have only one value each"
-        );
-        return Err(refused(problem, DepthRemedy::Repair));
-    }
-    let verdict = agreement.verdict();
-    if let Some(verdict) = verdict.filter(|_| source != DepthOrigin::Points) {
-        let unit = with.iter().find_map(|view| match view.source.depth.as_ref()?.meaning {
-            Meaning::Depth(unit) => Some(unit),
-            Meaning::Inverse(_) | Meaning::Unfitted => None,
-        });
-        judge(&verdict, *along, unit, &example)?;
-    }
-    Ok(Checked { views, empty, known: counted as f64 / pixels.max(1) as f64, verdict })
-}
-
-/// The points that a view sees.
-fn seen(scene: &Scene<'_>, view: &View) -> Vec<SeenPoint> {
-    seen_points(&scene.points.positions, &view.camera)
-}
-
-/// Refuses depth that disagrees with the points.
-fn judge(
-    verdict: &Verdict,
-    along: DepthAlong,
-    unit: Option<f64>,
-    example: &str,
-) -> Result<(), LoadError> {
-    let points = format!("{} points that the views see", grouped(verdict.pairs));
-    match verdict.fault {
-        Some(Fault::AlongRays) if along == DepthAlong::Axis => {
-            let problem = format!(
-                "{example}depth grows towards the corners of the pictures, compared with {points}: the values are \
-                 distances along rays, not along the optical axis"
-            );
-            return Err(refused(problem, DepthRemedy::AlongRay));
-        }
-        Some(Fault::AlongAxis) if along == DepthAlong::Ray => {
-            let problem = format!(
-                "{example}depth shrinks towards the corners of the pictures, compared with {points}: the values are \
-                 measured along the optical axis, not along rays"
-            );
-            return Err(refused(problem, DepthRemedy::AlongAxis));
-        }
-        Some(Fault::Inverse) => {
-            let problem = format!(
-                "{example}the values fall where {points} are farther away: they are inverse depth (disparity)"
-            );
-            return Err(refused(problem, DepthRemedy::Relative));
-        }
-        Some(Fault::Shifted(x, y)) => {
-            let problem = format!(
-                "{example}depth is shifted by ({x}, {y}) px against {points}: it belongs to another camera than the \
-                 photographs"
-            );
-            return Err(refused(problem, DepthRemedy::Register));
-        }
-        Some(Fault::AlongRays | Fault::AlongAxis) | None => {}
-    }
-    if (verdict.scale.ln()).abs() <= (1.0 + SCALE_REFUSED).ln() {
-        return Ok(());
-    }
-    let fitting = unit.map(|unit| {
-        let unit = unit / verdict.scale;
-        let usual =
-            USUAL_UNITS.iter().find(|(usual, _)| (unit / usual - 1.0).abs() < SCALE_REFUSED / 2.0);
-        let text = usual.map_or_else(|| format!("{unit:.3e}"), |(_, text)| (*text).to_owned());
-        format!("; a unit of {text} would fit")
-    });
-    let problem = format!(
-        "{example}depth is {} times that of {points}{}",
-        significant(verdict.scale),
-        fitting.unwrap_or_default()
-    );
-    Err(refused(problem, DepthRemedy::Unit))
-}
-
-/// A positive number with three digits.
-fn significant(value: f64) -> String {
-    let digits = (2.0 - value.log10().floor()).clamp(0.0, 9.0) as usize;
-    format!("{value:.digits$}")
-}
-
-/// Fits scale and offset of each view's relative map to the points that the view sees. Views whose fit is unreliable lose their depth.
-fn fit_views(scene: &mut Scene<'_>, notes: &mut Vec<Note>) -> Result<(), LoadError> {
-    let to_scene = scene.normalisation.scale;
-    let mut fits = Vec::new();
-    for view in scene.train.iter() {
-        let Some(depth) = &view.source.depth else {
-            fits.push(None);
-            continue;
-        };
-        let sampled = depth.sampled(&view.source)?;
-        let width = view.camera.width as usize;
-        let pairs: Vec<[f64; 2]> = seen(scene, view)
-            .into_iter()
-            .filter_map(|SeenPoint { pixel, depth }| {
-                let at = pixel.y as usize * width + pixel.x as usize;
-                let is_counted = sampled.inverse[at].is_finite() && sampled.confidence[at] > 0;
-                is_counted.then(|| [f64::from(sampled.inverse[at]), 1.0 / depth])
-            })
-            .collect();
-        fits.push(fit(&pairs));
-    }
-    let scales = fits.iter().flatten().map(|fit| fit[0]);
-    let Some(middle) = median(scales.clone().collect()) else {
-        let problem = format!(
-            "relative depth needs {FIT_POINTS} points in each view to fit its scale and offset, but no view sees them"
-        );
-        return Err(refused(problem, DepthRemedy::Unit));
-    };
-    if scales.clone().filter(|scale| *scale <= 0.0).count() * 2 > scales.count() {
-        let problem =
-            "the values grow where the points are farther away: they are depth, not inverse depth";
-        return Err(refused(problem.to_owned(), DepthRemedy::NotRelative));
-    }
-    let mut dropped = 0;
-    for (view, fit) in scene.train.iter_mut().zip(fits) {
-        let Some(depth) = &mut view.source.depth else { continue };
-        match fit {
-            Some([s, t]) if (FIT_SCALES[0] * middle..=FIT_SCALES[1] * middle).contains(&s) => {
-                depth.meaning = Meaning::Inverse([s * to_scene, t * to_scene]);
-            }
-            _ => {
-                view.source.depth = None;
-                dropped += 1;
-            }
-        }
-    }
-    if dropped > 0 {
-        notes.push(Note::Text(format!(
-            "the relative depth of {dropped} views could not be fitted to their points, and is not used"
-        )));
-    }
-    Ok(())
-}
-
-/// Scale and offset that map the first numbers to the second; the scale is negative if one falls where the other grows.
-///
-/// Some pairs are points that the view does not see. The fit therefore starts with the median of the slopes between
-/// distant pairs, and is repeated with the pairs that it describes best, by least squares.
-fn fit(pairs: &[[f64; 2]]) -> Option<[f64; 2]> {
-    if pairs.len() < FIT_POINTS {
-        return None;
-    }
-    let mut sorted = pairs.to_vec();
-    sorted.sort_by(|a, b| a[0].total_cmp(&b[0]));
-    let (low, high) = sorted.split_at(sorted.len() / 2);
-    let slopes = low.iter().zip(high).filter(|(a, b)| b[0] > a[0]);
-    let mut scale = median(slopes.map(|(a, b)| (b[1] - a[1]) / (b[0] - a[0])).collect())?;
-    let mut offset = median(pairs.iter().map(|[a, b]| b - scale * a).collect())?;
-    for _ in 0..FIT_ROUNDS {
-        let error = |[a, b]: &[f64; 2]| (b - scale * a - offset).abs();
-        let limit = FIT_WIDTH * median(pairs.iter().map(error).collect())?;
-        let kept: Vec<[f64; 2]> =
-            pairs.iter().filter(|&pair| error(pair) <= limit).copied().collect();
-        let count = kept.len() as f64;
-        let mean = |number: usize| kept.iter().map(|pair| pair[number]).sum::<f64>() / count;
-        let means = [mean(0), mean(1)];
-        let moment = |x: usize, y: usize| -> f64 {
-            kept.iter().map(|pair| (pair[x] - means[x]) * (pair[y] - means[y])).sum()
-        };
-        scale = moment(0, 1) / moment(0, 0);
-        offset = means[1] - scale * means[0];
-    }
-    (scale.is_finite() && offset.is_finite()).then_some([scale, offset])
-}
-
 /// The points of a cloud that seed a scene without points.
 pub(in super::super) fn first_points(
     options: &LoadOptions,
@@ -461,29 +225,4 @@ pub(in super::super) fn first_points(
     }
     let cloud = options.depth.points.as_deref().map(points::read).transpose()?;
     Ok(cloud.filter(|cloud| cloud.positions.iter().any(|point: &DVec3| point.is_finite())))
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn relative_depth_is_fitted_with_the_sign_of_the_relation() {
-        // A quarter of the points is hidden behind what the map shows.
-        let hidden = |i: i32| if i % 4 == 0 { 30.0 } else { 0.0 };
-        let pairs = |s: f64| -> Vec<[f64; 2]> {
-            (0..21).map(|i| [f64::from(i), s * f64::from(i) + 3.0 + hidden(i)]).collect()
-        };
-        for s in [0.5, -2.0] {
-            let [scale, offset] = fit(&pairs(s)).unwrap();
-            assert!((scale - s).abs() < 1e-9 && (offset - 3.0).abs() < 1e-9, "{scale} {offset}");
-        }
-        assert_eq!(fit(&pairs(1.0)[..9]), None);
-        assert_eq!(fit(&[[1.0, 2.0]; 12]), None, "a constant map has no scale");
-    }
-
-    #[test]
-    fn ratios_have_three_digits() {
-        assert_eq!([1000.4, 0.001_234_9, 1.05].map(significant), ["1000", "0.00123", "1.05"]);
-    }
 }

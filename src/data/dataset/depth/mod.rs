@@ -5,10 +5,12 @@
 //! turns, windows, undistortion and scaling are those of the photograph.
 
 mod agreement;
+mod check;
 mod colmap;
 mod decide;
 mod exr;
 mod files;
+mod fit;
 mod npy;
 mod options;
 mod params;

@@ -1,13 +1,16 @@
 //! Depth from a point cloud: the points are projected into each view with a z-buffer.
 
+use std::io::Read;
 use std::path::Path;
 
 use glam::DVec3;
 
 use super::super::LoadError;
 use super::super::normalise::Normalisation;
+use crate::las;
 use crate::points::{PointCloud, read_points};
 use densify_core::camera::Camera;
+use densify_core::files;
 
 /// A point is hidden if a neighbouring pixel shows one that is nearer by more than this share of its depth.
 const HIDDEN: f32 = 0.02;
@@ -69,9 +72,12 @@ impl PointSet {
     }
 }
 
-/// Reads the points of a PLY file.
+/// Reads the points of a PLY or LAS file, which is recognised by its first bytes.
 pub(in super::super) fn read(path: &Path) -> Result<PointCloud, LoadError> {
-    let (mut cloud, _) = read_points(path)?;
+    let mut start = Vec::new();
+    let file = files::open(path).map_err(LoadError::io(path))?;
+    file.take(las::MAGIC.len() as u64).read_to_end(&mut start).map_err(LoadError::io(path))?;
+    let mut cloud = if start == las::MAGIC { las::read(path)? } else { read_points(path)?.0 };
     cloud.retain(DVec3::is_finite);
     if cloud.is_empty() {
         return Err(LoadError::malformed(

@@ -1,18 +1,24 @@
 //! Samples a depth map at the centres of a view's pixels.
 //!
 //! Each pixel takes the nearest valid value, never a mean: between two surfaces a mean lies on neither. Where
-//! neighbours differ by more than 5 %, the confidence is 0, because sensors mix the two surfaces there.
+//! neighbours differ by more than 5 %, the confidence is 0, because sensors mix the two surfaces there. In noisy maps
+//! the limit is higher, or hardly any pixel would be left.
 
 use glam::DVec2;
 
 use super::super::LoadError;
 use super::super::images::ImageSource;
+use super::super::normalise::median;
 use super::raw::{self, Values};
 use super::{DepthAlong, DepthSource, From, MapFile, Meaning};
 use densify_core::image::depth::nearest_valid;
 
 /// Relative difference of neighbouring depths above which neither counts.
 const EDGE: f32 = 0.05;
+/// The limit is at least this multiple of the median difference, which is 2/3 of the standard deviation.
+const NOISE: f32 = 4.0;
+/// Number of pixels, at equal intervals, in which the median difference is measured.
+const MEASURED: usize = 4096;
 
 /// Inverse depths of a view and their confidences.
 #[derive(Debug, Clone, PartialEq)]
@@ -44,6 +50,7 @@ impl DepthSource {
         // The part of the map that a pixel covers, and the distance at which neighbours are compared.
         let half = 0.5 * file / shown * whole / header;
         let reach = [half.x, half.y].map(|half| (2.0 * half).round().max(1.0) as i64);
+        let limit = EDGE.max(NOISE * self.noise(values, reach));
         let pixels = self.camera.width as usize * self.camera.height as usize;
         let mut sampled =
             Sampled { inverse: Vec::with_capacity(pixels), confidence: Vec::with_capacity(pixels) };
@@ -65,7 +72,7 @@ impl DepthSource {
                     (self.inverse_of(values.as_raw()[found]) * factor) as f32
                 });
                 let weight = found.map_or(0, |found| {
-                    if self.is_edge(values, found, reach) {
+                    if self.neighbours(values, found, reach).any(|apart| apart > limit) {
                         return 0;
                     }
                     confidence.as_ref().map_or(255, |levels| levels[found])
@@ -137,19 +144,33 @@ impl DepthSource {
         }
     }
 
-    /// Returns true if a neighbour's depth differs from that of a pixel of the map by more than [`EDGE`].
-    fn is_edge(&self, values: &Values, pixel: usize, [dx, dy]: [i64; 2]) -> bool {
+    /// The median relative difference of neighbours in a map.
+    fn noise(&self, values: &Values, reach: [i64; 2]) -> f32 {
+        let stride = values.len().div_ceil(MEASURED).max(1);
+        let pixels = (0..values.len()).step_by(stride);
+        let apart = pixels.flat_map(|pixel| self.neighbours(values, pixel, reach));
+        median(apart.map(f64::from).collect()).unwrap_or(0.0) as f32
+    }
+
+    /// The relative differences between the depth of a pixel of the map and those of its neighbours that are known.
+    fn neighbours(
+        &self,
+        values: &Values,
+        pixel: usize,
+        [dx, dy]: [i64; 2],
+    ) -> impl Iterator<Item = f32> {
         let (width, height) = (i64::from(values.width()), i64::from(values.height()));
         let (x, y) = (pixel as i64 % width, pixel as i64 / width);
         let here = self.inverse_of(values.as_raw()[pixel]) as f32;
-        [(dx, 0), (-dx, 0), (0, dy), (0, -dy)].into_iter().any(|(dx, dy)| {
+        [(dx, 0), (-dx, 0), (0, dy), (0, -dy)].into_iter().filter_map(move |(dx, dy)| {
             let (x, y) = (x + dx, y + dy);
             if x < 0 || y < 0 || x >= width || y >= height {
-                return false;
+                return None;
             }
             let there = self.inverse_of(values.as_raw()[(y * width + x) as usize]) as f32;
-            // Comparisons with NaN, an unknown neighbour, are false.
-            (here - there).abs() > EDGE * here.abs().min(there.abs())
+            let apart = (here - there).abs() / here.abs().min(there.abs());
+            // Unknown neighbours are NaN.
+            apart.is_finite().then_some(apart)
         })
     }
 }

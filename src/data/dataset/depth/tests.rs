@@ -357,6 +357,22 @@ fn depth_in_open_exr_and_with_a_mask_and_a_smaller_map_is_read() {
 }
 
 #[test]
+fn noise_is_no_edge() {
+    let known = |noise: f32| {
+        let room = Room::new();
+        room.edit(|view, [x, y], values| {
+            let mixed =
+                (view as u64 * 7919 + u64::from(y * SIDE + x)).wrapping_mul(0x9E37_79B9_7F4A_7C15);
+            let unit = (mixed >> 40) as f32 / 16_777_216.0;
+            values[(x, y)].0[0] * (1.0 + noise * (unit - 0.5))
+        });
+        room.load(&with(on())).unwrap().depth.unwrap().known
+    };
+    let (clean, noisy) = (known(0.0), known(0.2));
+    assert!(noisy > 0.9 * clean && noisy < 1.1, "{noisy} with noise, {clean} without");
+}
+
+#[test]
 fn points_become_sparse_depth() {
     let room = Room::new();
     let points = Some(room.path().join("points3d.ply"));

@@ -13,7 +13,7 @@ use pulp::{Scalar, Simd};
 pub(super) const WIDTH: usize = 16;
 
 /// The sign bit of a lane.
-const SIGN: u32 = 1 << 31;
+pub(super) const SIGN: u32 = 1 << 31;
 
 /// `[e(0), e(1), …]` without a closure: `each!(k in 3 => e(k))`.
 ///
@@ -109,6 +109,14 @@ impl<S: Simd> V<S> {
         let s = self.s;
         let bits = s.transmute_u32s_f32s(self.v);
         Self::of_bits(s, s.and_u32s(bits, s.splat_u32s(!SIGN)))
+    }
+
+    /// The number, negated where the bits `mask` of `other` are set; `mask` is [`SIGN`] or 0.
+    #[inline(always)]
+    pub(super) fn with_sign_of(self, other: Self, mask: u32) -> Self {
+        let s = self.s;
+        let sign = s.and_u32s(s.transmute_u32s_f32s(other.v), s.splat_u32s(mask));
+        Self::of_bits(s, s.xor_u32s(s.transmute_u32s_f32s(self.v), sign))
     }
 
     #[inline(always)]

@@ -17,8 +17,7 @@ use super::rasterize::{
     ALPHA_MAX, Blending, DEPTH, DepthPlane, PATCHES, Plane, TRANSMITTANCE, TileCanvas, TilePlace,
     ZERO_PLANE,
 };
-use super::rasterize_bwd::gather_all;
-use super::records::{Sums, TileRecords, parts};
+use super::records::{Sums, TileRecords, gather_all, parts};
 use super::simd::{V, WIDTH};
 use super::tiles::{Entry, Visible};
 use super::{BackendError, CpuBackend};

@@ -90,6 +90,7 @@ fn every_override_has_a_value_and_every_signal_a_number() {
     let variant = Variant {
         records: RecordLayout::DIFFERENTIATED,
         alpha_and_depth: true,
+        depth: true,
         shortcuts: Shortcuts::default(),
         antialiasing: Antialiasing::Wide,
         formats: SLOTS,
@@ -123,7 +124,7 @@ fn largest_sizes(formats: Formats) -> Sizes {
         error_score: ErrorScore { edge: 1.0, ..ErrorScore::default() },
         ..Needs::default()
     };
-    let mut sizes = Sizes::new(10.into(), 100, 3, (32, 32), &needs, formats.accumulation);
+    let mut sizes = Sizes::new(10.into(), 100, 3, (32, 32), &needs, true, formats.accumulation);
     if formats.moments_in_bytes {
         sizes.storage.moments = MomentStorage::Both8;
     }
@@ -212,7 +213,7 @@ fn struct_layouts_are_those_of_the_shaders() {
     let module = parse(project, &text);
     let layouts = [
         layout!(Frame: rotation centre lens ratio background image model rates more_rates noise score errors draw frozen planes),
-        layout!(State: visible total bands short entries_low entries_high held broken_off l1 ssim spare_f),
+        layout!(State: visible total bands short entries_low entries_high held broken_off l1 ssim depth spare_f),
     ];
     for (name, mut expected, size) in layouts {
         let found = module.types.iter().find(|(_, t)| t.name.as_deref() == Some(name));

@@ -15,11 +15,11 @@ const ROWS: u64 = 1_000_000;
 const ENTRIES_IN_MEMORY: u64 = 2 * ROWS;
 const IMAGE: (u32, u32) = (1600, 1000);
 
-fn sizes(rows: u64, entries: u64, image: (u32, u32)) -> Sizes {
+fn sizes(rows: u64, entries: u64, image: (u32, u32), depth: bool) -> Sizes {
     let signals = [Signal::VisibleCount, Signal::ScreenGradient, Signal::WeightMax];
     let needs = Needs { signals: signals.into_iter().collect(), ..Needs::default() };
     let rows = usize::try_from(rows).expect("64 bits");
-    Sizes::new(rows.into(), entries, 3, image, &needs, Accumulation::SubgroupCas)
+    Sizes::new(rows.into(), entries, 3, image, &needs, depth, Accumulation::SubgroupCas)
 }
 
 /// Bytes of every buffer and range.
@@ -29,12 +29,12 @@ fn bytes(sizes: &Sizes) -> HashMap<&'static str, u64> {
 }
 
 /// Bytes per row, per entry and per pixel of every buffer and range.
-fn rates() -> HashMap<&'static str, [f64; 3]> {
-    let base = bytes(&sizes(ROWS, ENTRIES_IN_MEMORY, IMAGE));
+fn rates(depth: bool) -> HashMap<&'static str, [f64; 3]> {
+    let base = bytes(&sizes(ROWS, ENTRIES_IN_MEMORY, IMAGE, depth));
     let more = [
-        bytes(&sizes(2 * ROWS, ENTRIES_IN_MEMORY, IMAGE)),
-        bytes(&sizes(ROWS, ENTRIES_IN_MEMORY + ROWS, IMAGE)),
-        bytes(&sizes(ROWS, ENTRIES_IN_MEMORY, (IMAGE.0, 2 * IMAGE.1))),
+        bytes(&sizes(2 * ROWS, ENTRIES_IN_MEMORY, IMAGE, depth)),
+        bytes(&sizes(ROWS, ENTRIES_IN_MEMORY + ROWS, IMAGE, depth)),
+        bytes(&sizes(ROWS, ENTRIES_IN_MEMORY, (IMAGE.0, 2 * IMAGE.1), depth)),
     ];
     let pixels = f64::from(IMAGE.0 * IMAGE.1);
     let steps = [ROWS as f64, ROWS as f64, pixels];
@@ -73,7 +73,7 @@ impl Counter {
         let groups = is_counted.then(|| ("groups".to_owned(), false));
         let accesses = || launch.0.iter().cloned().chain(groups.clone());
         let scratch: BTreeSet<_> =
-            sizes(ROWS, ENTRIES_IN_MEMORY, IMAGE).ranges().iter().map(|r| r.name).collect();
+            sizes(ROWS, ENTRIES_IN_MEMORY, IMAGE, false).ranges().iter().map(|r| r.name).collect();
         // Ranges of the scratch buffer are one buffer to wgpu.
         let buffer =
             |name: String| if scratch.contains(&*name) { SCRATCH.to_owned() } else { name };
@@ -141,35 +141,64 @@ fn launches(sizes: &Sizes) -> Launches<Bound> {
     Launches::new(accesses.keys().map(String::as_str), &bind, sizes)
 }
 
+/// The dispatches of a step of a large model, with or without depth in the loss.
+fn count_step(depth: bool) -> Vec<Tally> {
+    let sizes = sizes(ROWS, ENTRIES_IN_MEMORY, IMAGE, depth);
+    let launches = launches(&sizes);
+    let shape = Shape { rows: ROWS as u32, tiles: 100 * 63, bands: 1 };
+    let passes = Passes { launches: &launches, shape };
+    let mut counter = Counter { stages: Vec::new(), rates: rates(depth), used: HashMap::new() };
+    passes.forward(&mut counter);
+    if depth {
+        passes.depth_gradient(&mut counter, IMAGE.0 * IMAGE.1, [1.0; 4]);
+    }
+    passes.loss(&mut counter, false, true);
+    passes.backward(&mut counter);
+    passes.optimise(&mut counter, 3, true, None);
+    counter.stages
+}
+
+/// Dispatches, barriers, bytes per row, per entry, per pixel.
+fn table(stages: &[Tally]) -> Vec<String> {
+    let row = |Tally { name, dispatches, barriers, bytes: [row, entry, pixel] }: &Tally| {
+        format!("{name}: {dispatches}, {barriers}, {row:.0}, {entry:.0}, {pixel:.0}")
+    };
+    stages.iter().map(row).collect()
+}
+
 /// What a step of a large model costs the device: this table changes whenever a kernel reads or writes another buffer, or
 /// another dispatch is added. It counts whole buffers, of which a kernel may use a part.
 #[test]
 fn a_step_has_the_known_dispatches_barriers_and_bytes() {
-    let sizes = sizes(ROWS, ENTRIES_IN_MEMORY, IMAGE);
-    let launches = launches(&sizes);
-    let shape = Shape { rows: ROWS as u32, tiles: 100 * 63, bands: 1 };
-    let passes = Passes { launches: &launches, shape };
-    let mut counter = Counter { stages: Vec::new(), rates: rates(), used: HashMap::new() };
-    passes.forward(&mut counter);
-    passes.loss(&mut counter, false, true);
-    passes.backward(&mut counter);
-    passes.optimise(&mut counter, 3, true, None);
-    let row = |Tally { name, dispatches, barriers, bytes: [row, entry, pixel] }: &Tally| {
-        format!("{name}: {dispatches}, {barriers}, {row:.0}, {entry:.0}, {pixel:.0}")
-    };
-    let found: Vec<_> = counter.stages.iter().map(row).collect();
-    // Dispatches, barriers, bytes per row, per entry, per pixel.
+    let stages = count_step(false);
     let expected = [
-        "project: 1, 0, 290, 0, 0",
-        "sort by depth: 12, 12, 0, 0, 0",
-        "tiles: 11, 11, 0, 0, 0",
-        "rasterize: 1, 1, 0, 0, 0",
-        "loss: 6, 6, 0, 0, 0",
-        "rasterize_bwd: 2, 2, 0, 0, 0",
-        "project_bwd: 2, 2, 0, 0, 0",
-        "adam: 5, 5, 0, 0, 0",
+        "project: 1, 0, 288, 0, 0",
+        "sort by depth: 12, 12, 372, 76, 0",
+        "tiles: 11, 11, 220, 52, 0",
+        "rasterize: 1, 1, 40, 4, 24",
+        "loss: 6, 6, 240, 0, 128",
+        "rasterize_bwd: 2, 2, 120, 4, 24",
+        "project_bwd: 2, 2, 416, 0, 0",
+        "adam: 5, 4, 1171, 0, 0",
     ];
-    assert_eq!(found, expected);
-    let dispatches: u32 = counter.stages.iter().map(|stage| stage.dispatches).sum();
+    assert_eq!(table(&stages), expected);
+    let dispatches: u32 = stages.iter().map(|stage| stage.dispatches).sum();
     assert!(dispatches <= 40, "{dispatches}");
+}
+
+/// Depth in the loss adds a stage. The canvas, the transmittances with the channel, and the given depth are read or
+/// written once more, and records have another number.
+#[test]
+fn depth_in_the_loss_costs_two_dispatches() {
+    let [without, with] = [false, true].map(|depth| table(&count_step(depth)));
+    let added: Vec<_> = with.iter().filter(|row| !without.contains(row)).collect();
+    let expected = [
+        "rasterize: 1, 1, 40, 4, 32",
+        "depth_gradient: 2, 2, 0, 0, 37",
+        "loss: 6, 6, 264, 0, 128",
+        "rasterize_bwd: 2, 2, 128, 4, 32",
+        "project_bwd: 2, 2, 424, 0, 0",
+        "adam: 5, 4, 1191, 0, 0",
+    ];
+    assert_eq!(added, expected);
 }

@@ -29,6 +29,11 @@ pub struct Geometry {
     pub centres: CentreErrors,
     /// Opaque rows in empty space.
     pub floaters: Floaters,
+    /// Fraction of the weight w whose rows lie before the surface: in each training view, the camera z of a row's centre
+    /// is compared with the surface's depth at the pixel of the centre (or the nearest pixel), and is more than 5 %
+    /// smaller. Unlike [`Floaters`], this counts large and faint rows too.
+    #[serde(default = "nan", deserialize_with = "or_nan")]
+    pub weight_before_surface: f64,
     /// Recall of thin structures by width, thinnest first; empty if the scene has none.
     pub thin: Vec<ThinRecall>,
     /// Rows with negligible contributions.
@@ -45,6 +50,11 @@ pub struct DepthErrors {
     /// Mean of |error| / depth.
     #[serde(deserialize_with = "or_nan")]
     pub abs_rel: f64,
+    /// Root mean square distance, weighted by w, between the camera z of the rows' centres and the rendered depth at
+    /// their pixels, over all training views `[diagonals]`: how far the rows that make up a pixel are spread along its
+    /// ray.
+    #[serde(default = "nan", deserialize_with = "or_nan")]
+    pub spread: f64,
     /// Fraction of the pixels showing a surface that have a rendered alpha above 0.5.
     #[serde(deserialize_with = "or_nan")]
     pub coverage: f64,
@@ -140,6 +150,11 @@ pub fn bytes(rows: usize, sh_degree: u8, image: (u32, u32), views: usize) -> u64
     let row = 2 * 4 * (11 + 3 * densify_core::gaussians::sh_coefficients(sh_degree) as u64) + 512;
     let pixels = u64::from(image.0) * u64::from(image.1);
     rows as u64 * row + pixels * 128 + views as u64 * (16 << 10) + (4 << 20)
+}
+
+/// The value of a measurement that files of older versions lack.
+fn nan() -> f64 {
+    f64::NAN
 }
 
 /// Reads a number that may be NaN, which JSON writes as null.

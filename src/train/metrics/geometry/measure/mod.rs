@@ -38,10 +38,11 @@ pub fn measure(
         pixels.add(backend, views, view)?;
     }
     Ok(Geometry {
-        depth: pixels.depth(),
+        depth: DepthErrors { spread: visibility.spread(scene.diagonal()), ..pixels.depth() },
         normal_error: pixels.normal_error(),
         centres: centres::errors(&rows, &visibility, scene)?,
         floaters: visibility.floaters(&rows, scene.diagonal()),
+        weight_before_surface: visibility.before_surface(),
         thin: pixels.thin(),
         redundancy: visibility.redundancy(),
     })

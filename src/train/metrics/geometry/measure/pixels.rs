@@ -124,6 +124,8 @@ impl<'a> Pixels<'a> {
             rmse: ratio(self.squared_errors, covered).sqrt() / self.scene.diagonal(),
             abs_rel: ratio(self.relative_errors, covered),
             coverage: ratio(covered, self.surface_pixels as f64),
+            // This is measured in the training views.
+            spread: f64::NAN,
         }
     }
 
@@ -145,7 +147,7 @@ impl<'a> Pixels<'a> {
 }
 
 /// Rendered depth of a pixel `[world units]`; `None` if the pixel is not covered.
-fn depth_at(rendering: &Rendering, pixel: usize, scale: f64) -> Option<f64> {
+pub(super) fn depth_at(rendering: &Rendering, pixel: usize, scale: f64) -> Option<f64> {
     let alpha = rendering.alpha[pixel];
     (alpha > COVERED).then(|| f64::from(rendering.depth[pixel]) / f64::from(alpha) / scale)
 }

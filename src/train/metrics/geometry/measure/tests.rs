@@ -203,6 +203,28 @@ fn invisible_rows_and_surfaces_do_not_count() {
 }
 
 #[test]
+fn weight_before_the_surface_and_its_spread_are_measured() {
+    let truth = truth(&square(), 2);
+    let on = measured(&truth, &carpet(0.0));
+    assert_eq!(on.weight_before_surface, 0.0);
+    close(on.depth.spread, 0.0, 1e-6);
+    // 5 % of the distance is the limit.
+    assert_eq!(measured(&truth, &carpet(-0.04 * DISTANCE)).weight_before_surface, 0.0);
+    assert_eq!(measured(&truth, &carpet(-0.06 * DISTANCE)).weight_before_surface, 1.0);
+    // A veil, which is too large for a floater, takes half of the light one unit before the opaque rows.
+    let mut model = carpet(0.0);
+    for row in 0..model.len() {
+        model.opacity_logits[row] = logit(0.99);
+    }
+    push(&mut model, DVec3::new(0.0, 0.0, -1.0), DVec3::new(50.0, 50.0, 0.01), 0.5);
+    let veiled = measured(&truth, &model);
+    assert_eq!(veiled.floaters.count, 0);
+    close(veiled.depth.spread, 0.5 / DIAGONAL, 0.02);
+    // The veil also has weight beside the square, which covers 4/9 of each view.
+    close(veiled.weight_before_surface, 0.5 / (0.5 + 0.5 * 4.0 / 9.0), 0.05);
+}
+
+#[test]
 fn a_tilt_of_normals_is_measured() {
     let mut model = carpet(0.0);
     let tilt = DQuat::from_rotation_x(20f64.to_radians());
@@ -289,6 +311,12 @@ fn measurements_without_data_are_nan() {
     assert!(text.contains(r#""rmse":null"#), "{text}");
     let back: Geometry = serde_json::from_str(&text).unwrap();
     assert!(back.depth.rmse.is_nan() && back.depth.coverage == 0.0);
+    // Files of older versions lack some measurements.
+    let older =
+        text.replace(r#""weight_before_surface":null,"#, "").replace(r#""spread":null,"#, "");
+    assert!(!older.contains("spread") && !older.contains("before"), "{older}");
+    let back: Geometry = serde_json::from_str(&older).unwrap();
+    assert!(back.depth.spread.is_nan() && back.weight_before_surface.is_nan());
 }
 
 /// A mesh of triangles with vertices of their own.

@@ -7,6 +7,7 @@ use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng, SeedableRng};
 use rayon::prelude::*;
 
+use super::pixels::depth_at;
 use super::rows::Rows;
 use super::{Floaters, KnownScene, Redundancy, needs, ratio};
 use crate::metrics::EvaluateError;
@@ -22,6 +23,8 @@ const SEED: u64 = 0x6d65_7368;
 const MIN_OPACITY: f32 = 0.05;
 /// Smallest distance of a floater from the mesh `[diagonals]`.
 const MIN_DISTANCE: f64 = 0.01;
+/// Share of the surface's depth by which a row must be nearer to lie before the surface.
+const BEFORE: f64 = 0.05;
 /// Blend weight below which a row has a negligible effect.
 const NEGLIGIBLE: f32 = 0.01;
 /// Minimum number of views that see through a floater's position, or that see a counted sample of the mesh.
@@ -37,6 +40,10 @@ pub(super) struct Visibility {
     seen_through: Vec<u32>,
     /// Numbers of blended (row, pixel) pairs and of pixels.
     blended: (f64, f64),
+    /// Weight of rows before the surface, and of all rows.
+    before: (f64, f64),
+    /// Sum of w·(z − depth)² `[world units²]`, and of the weights w.
+    squares: (f64, f64),
     /// Samples of the mesh that are visible in enough views.
     pub(super) samples: Vec<DVec3>,
 }
@@ -55,6 +62,8 @@ impl Visibility {
             peaks: vec![0.0; rows.len()],
             seen_through: vec![0; rows.len()],
             blended: (0.0, 0.0),
+            before: (0.0, 0.0),
+            squares: (0.0, 0.0),
             samples: Vec::new(),
         };
         let request = needs().aux.unwrap_or_default();
@@ -62,9 +71,15 @@ impl Visibility {
             let name = views.name(number);
             let failed = |source| EvaluateError::Backend { view: name.to_owned(), source };
             let camera = views.camera(number);
-            visibility.add_weights(backend, scene, camera, &request).map_err(failed)?;
+            let weights = visibility.add_weights(backend, scene, camera, &request);
+            let weights = weights.map_err(failed)?;
+            let rendering = backend.render(camera, scene.background, scene.sh_degree);
+            let rendering = rendering.map_err(failed)?;
             let (world, ray_camera) = scene.cameras(camera);
             let g_buffer = scene.g_buffer(name, &ray_camera)?;
+            visibility.add_depths(rows, &weights, &world, &g_buffer, |pixel| {
+                depth_at(&rendering, pixel, scene.normalisation.scale)
+            });
             let places = visibility.seen_through.par_iter_mut().zip(&rows.centres);
             places.for_each(|(seen_through, &place)| {
                 *seen_through += u32::from(sees_through(&world, &g_buffer, place));
@@ -82,14 +97,55 @@ impl Visibility {
         Ok(visibility)
     }
 
-    /// Adds the blend weights of one view.
+    /// Compares the depths of the rows that one view shows with the surface and with the rendered depth.
+    fn add_depths(
+        &mut self,
+        rows: &Rows,
+        weights: &[f32],
+        camera: &Camera,
+        g_buffer: &GBuffer,
+        rendered: impl Fn(usize) -> Option<f64>,
+    ) {
+        let last = |side: u32| f64::from(side.max(1) - 1);
+        for (&weight, &place) in weights.iter().zip(&rows.centres) {
+            let (pixel, depth) = camera.project(place);
+            if weight <= 0.0 || depth <= 0.0 || !pixel.is_finite() {
+                continue;
+            }
+            let weight = f64::from(weight);
+            let x = pixel.x.clamp(0.0, last(g_buffer.width)) as usize;
+            let y = pixel.y.clamp(0.0, last(g_buffer.height)) as usize;
+            let at = y * g_buffer.width as usize + x;
+            let shown = f64::from(g_buffer.depth[at]);
+            self.before.1 += weight;
+            if shown > 0.0 && depth < (1.0 - BEFORE) * shown {
+                self.before.0 += weight;
+            }
+            if let Some(rendered) = rendered(at) {
+                self.squares.0 += weight * (depth - rendered) * (depth - rendered);
+                self.squares.1 += weight;
+            }
+        }
+    }
+
+    /// See [`Geometry::weight_before_surface`](super::Geometry::weight_before_surface).
+    pub(super) fn before_surface(&self) -> f64 {
+        ratio(self.before.0, self.before.1)
+    }
+
+    /// See [`DepthErrors::spread`](super::DepthErrors::spread).
+    pub(super) fn spread(&self, diagonal: f64) -> f64 {
+        ratio(self.squares.0, self.squares.1).sqrt() / diagonal
+    }
+
+    /// Adds the blend weights of one view, and returns them. Shape: `[rows]`.
     fn add_weights(
         &mut self,
         backend: &mut dyn Backend,
         scene: &KnownScene<'_>,
         camera: &Camera,
         request: &AuxRequest,
-    ) -> Result<(), densify_render::BackendError> {
+    ) -> Result<Vec<f32>, densify_render::BackendError> {
         let Camera { width, height, .. } = *camera;
         let pixels = width as usize * height as usize;
         // The requested weights do not depend on the target.
@@ -105,11 +161,13 @@ impl Visibility {
             sh_degree: scene.sh_degree,
             request,
         })?;
+        let mut weights = Vec::new();
         for (column, values) in output.columns {
             let numbers = values.iter().map(|&value| f64::from(value));
             match column {
                 AuxColumn::WeightSum => {
                     self.weights.iter_mut().zip(numbers).for_each(|(sum, value)| *sum += value);
+                    weights = values;
                 }
                 AuxColumn::WeightMax => {
                     let peaks = self.peaks.iter_mut().zip(values);
@@ -120,7 +178,7 @@ impl Visibility {
             }
         }
         self.blended.1 += pixels as f64;
-        Ok(())
+        Ok(weights)
     }
 
     /// True for a floater, by the definition of [`Floaters`].
