@@ -20,9 +20,12 @@ def read(path: Path) -> tuple[trimesh.Trimesh, np.ndarray]:
     scene = trimesh.load_scene(path, process=False)
     assert len(scene.geometry) == 1, f"{path}: {len(scene.geometry)} meshes"
     mesh = scene.to_mesh()
-    colours = mesh.visual.vertex_colors[:, :3].astype(float)
-    # glTF's colours are linear; trimesh keeps them in 8 bits.
-    return mesh, 255 * encoded(colours / 255) if path.suffix == ".glb" else colours
+    if path.suffix != ".glb":
+        return mesh, mesh.visual.vertex_colors[:, :3].astype(float)
+    # Beside a material, trimesh keeps colours as an attribute of the geometry. Those of glTF are linear.
+    (geometry,) = scene.geometry.values()
+    colours = geometry.visual.vertex_attributes["color"]
+    return mesh, 255 * encoded(colours[:, :3] / np.iinfo(colours.dtype).max)
 
 
 def check(path: Path) -> tuple[trimesh.Trimesh, np.ndarray]:
@@ -30,16 +33,20 @@ def check(path: Path) -> tuple[trimesh.Trimesh, np.ndarray]:
     print(f"{path.name}: {len(mesh.vertices)} vertices, {len(mesh.faces)} faces, watertight: {mesh.is_watertight}")
     assert len(mesh.faces) > 100 and len(colours) == len(mesh.vertices), path
     assert np.isfinite(mesh.vertices).all() and (mesh.area_faces >= 0).all(), path
-    # Each vertex is used, no triangle occurs twice, and neighbours agree on what is outside.
+    # Each vertex is used, and no triangle occurs twice.
     assert len(np.unique(mesh.faces)) == len(mesh.vertices), f"{path}: unused vertices"
     assert len(np.unique(np.sort(mesh.faces, axis=1), axis=0)) == len(mesh.faces), f"{path}: triangles occur twice"
-    assert mesh.is_winding_consistent, f"{path}: neighbouring triangles face opposite sides"
+    # Neighbours agree on what is outside, except for a few at borders where two surfaces share an edge.
+    pairs = trimesh.grouping.group_rows(mesh.edges_sorted, require_count=2)
+    same = (mesh.edges[pairs[:, 0]] == mesh.edges[pairs[:, 1]]).all(axis=1)
+    print(f"    {same.sum()} of {len(same)} pairs of neighbours face opposite sides")
+    assert same.mean() < 1e-3, f"{path}: neighbouring triangles face opposite sides"
     assert colours.std() > 5, f"{path}: the colours are uniform"
-    # The parts without a border enclose space, and are not inside out.
-    closed = [part for part in mesh.split(only_watertight=True)]
-    print(f"    {len(closed)} closed parts of {mesh.body_count}")
-    for part in closed:
-        assert part.volume > 0, f"{path}: a part of {len(part.faces)} faces is inside out"
+    # Each edge that is not at the border of what was seen has two triangles; a few have four.
+    _, counts = np.unique(mesh.edges_sorted, axis=0, return_counts=True)
+    shares = {int(count): round(float((counts == count).mean()), 4) for count in np.unique(counts)}
+    print(f"    triangles per edge: {shares}; watertight parts: {len(mesh.split(only_watertight=True))}")
+    assert shares.get(2, 0) > 0.9 and max(shares) <= 4, f"{path}: {shares}"
     return mesh, colours
 
 
@@ -51,6 +58,5 @@ if __name__ == "__main__":
         tolerance = 1e-4 * first.scale
         assert np.abs(mesh.vertices - first.vertices).max() < tolerance, f"{other}: other positions"
         assert np.abs(mesh.bounds - first.bounds).max() < tolerance, f"{other}: other bounds"
-        # Linear values in 8 bits are coarse for dark colours.
-        assert np.abs(others - colours).mean() < 4, f"{other}: other colours"
+        assert np.abs(others - colours).max() < 1.5, f"{other}: other colours"
     print("trimesh can read the meshes")
