@@ -20,9 +20,9 @@
 @group(0) @binding(6) var<storage, read_write> values_in: array<u32>;
 @group(0) @binding(7) var<storage, read_write> keys_out: array<u32>;
 @group(0) @binding(8) var<storage, read_write> values_out: array<u32>;
-// Numbers to sum, then their prefix sums within their block of 2,048.
+// Numbers to sum, then their prefix sums: within their block of 2,048, or, of a sort's digits, over all blocks.
 @group(0) @binding(9) var<storage, read_write> sums: array<u32>;
-// Prefix sums over the blocks.
+// Prefix sums over the blocks, or, in a sort, the total of each digit.
 @group(0) @binding(10) var<storage, read_write> block_sums: array<u32>;
 // Rows on screen, front to back.
 @group(0) @binding(11) var<storage, read> order: array<u32>;

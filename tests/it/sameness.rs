@@ -84,6 +84,28 @@ fn threads_change_nothing() {
 }
 
 #[test]
+fn a_differentiation_does_not_change_training() {
+    let camera = scenes::camera(60, 50, 33);
+    let model = scenes::cloud(80, 1, &camera, 43);
+    for subject in repeatable() {
+        let trained = |differentiated: bool| {
+            let mut backend = make(&subject, &model);
+            if differentiated {
+                differentiate(&mut *backend, &camera, 1);
+            }
+            let (_, target) = scenes::noisy((camera.width, camera.height), 0.0, 3);
+            let outputs: Vec<_> =
+                (1..=3).map(|n| backend.train_step(&step_input(n, &camera, &target, 1))).collect();
+            assert!(outputs.iter().all(Result::is_ok), "{subject:?}: {outputs:?}");
+            backend.download().expect("a model")
+        };
+        let expected = trained(false);
+        assert!(expected != model, "{subject:?}: nothing was trained");
+        assert!(trained(true) == expected, "{subject:?}");
+    }
+}
+
+#[test]
 fn bands_change_nothing() {
     let camera = scenes::camera(140, 120, 32);
     let model = scenes::cloud(150, 1, &camera, 42);

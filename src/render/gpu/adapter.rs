@@ -55,7 +55,7 @@ impl AdapterSummary {
     }
 
     /// Largest budget that this adapter supports at an SH degree: each array of rows (the geometry, a band of
-    /// coefficients, the gradients) must fit into one buffer.
+    /// coefficients, the sums of gradients) must fit into one buffer.
     pub fn largest_budget(&self, sh_degree: u8) -> u64 {
         let largest = self.largest_binding.min(self.largest_buffer);
         (largest / widest_row(sh_degree)).min(MAX_ROWS)

@@ -103,7 +103,10 @@ fn run(
             target,
             background: BACKGROUND,
             exposure: None,
-            depth: map.map(|map| DepthTarget { map, weight: 1.0, term: DepthTerm::Samples }),
+            depth: map.map(|map| {
+                let term = if step == 1 { DepthTerm::Expected } else { DepthTerm::Samples };
+                DepthTarget { map, weight: 1.0, term }
+            }),
             distortion: if map.is_some() { 1.0 } else { 0.0 },
             sh_degree: 1,
             rates,

@@ -20,8 +20,9 @@ pub(super) fn max_pairs(device: &Device, needs: &Needs, depth: bool) -> u64 {
         Accumulation::SubgroupCas | Accumulation::SubgroupAtomics => 1,
     };
     let by_binding = device.largest_binding() / (4 * numbers);
-    // Three lists are sorted in one buffer, each at an aligned place.
-    let by_buffer = (device.summary.largest_buffer / 3).saturating_sub(256) / 4;
+    // Three lists are sorted in one buffer, each at an aligned place, and with them as many sums of entries per row, or
+    // of digits per block, as there are pairs at most: there are no more rows than pairs.
+    let by_buffer = (device.summary.largest_buffer / 4).saturating_sub(2 * 256) / 4;
     by_binding.min(by_buffer).min(MAX_ENTRIES)
 }
 

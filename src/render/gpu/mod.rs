@@ -44,7 +44,7 @@ use densify_policies::policy::{Cadence, Candidate, MaskTerm, SignalKind, SignalS
 
 use super::candidates::Candidates;
 use super::cpu::{BiasCorrection, MAX_SIDE};
-use super::signals::{ParameterSignal, SignalPlanes, value_of};
+use super::signals::{ParameterSignal, RecordLayout, SignalPlanes, value_of};
 use super::{
     AdapterSummary, AuxInput, AuxOutput, Backend, BackendError, Inspect, NonFinite, Rendering,
     Setup, Shortcuts, StateArray, StateError, StepInput, StepOutput, Tensor, assert_fits,
@@ -97,6 +97,8 @@ pub struct GpuBackend {
     shortcuts: Shortcuts,
     antialiasing: Antialiasing,
     planes: SignalPlanes,
+    /// The records of training steps, which [`differentiate`](crate::Differentiable::differentiate) replaces.
+    records: RecordLayout,
     mask: Option<MaskTerm>,
     cadence: Cadence,
     waiting: Waiting,
@@ -141,6 +143,7 @@ impl GpuBackend {
         let gpu = Self {
             ledger,
             device,
+            records: sizes.records,
             sizes,
             buffers,
             launches,

@@ -5,6 +5,7 @@ use std::ops::Range;
 
 use crate::NumberKind;
 use crate::cpu::{MEANS, narrowed, widened};
+use crate::signals::RecordLayout;
 use densify_core::gaussians::ModelArray;
 use densify_core::memory::Section;
 
@@ -260,5 +261,6 @@ pub(super) fn row_arrays(
 /// Bytes per row of the widest array for models of this SH degree, for any policy.
 pub(super) fn widest_row(sh_degree: u8) -> u64 {
     let arrays = row_arrays(sh_degree, [false; 2], Narrow::default(), [0; 5]);
-    arrays.iter().map(RowArray::row_bytes).max().unwrap_or(0)
+    let sums = 4 * RecordLayout::MOST as u64;
+    arrays.iter().map(RowArray::row_bytes).fold(sums, u64::max)
 }

@@ -37,6 +37,10 @@ impl GpuBackend {
         let StepInput { camera, target, background, exposure, .. } = *input;
         assert_same_size(camera, target);
         let start = Instant::now();
+        if self.sizes.alpha_and_depth {
+            (self.sizes.alpha_and_depth, self.sizes.records) = (false, self.records);
+            self.rebuild()?;
+        }
         self.fit_image(camera.width, camera.height)?;
         let (due, waiting) = self.cadence_bits(input);
         let mut frame = self.frame(camera, background, input.sh_degree);

@@ -190,7 +190,11 @@ impl<'a> Case<'a> {
         let resident = || (host.process.resident)().unwrap_or(0);
         let before = resident();
         // Kernels depend on the signals, not on the number of rows.
-        self.inputs.device.prove(&self.needs(MIN_ROWS)?, self.choices.knobs.storage, false)?;
+        self.inputs.device.prove(
+            &self.needs(MIN_ROWS)?,
+            self.choices.knobs.storage,
+            self.has_depth(),
+        )?;
         Ok(resident().saturating_sub(before))
     }
 

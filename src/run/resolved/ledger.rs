@@ -59,9 +59,14 @@ impl Case<'_> {
             shortcuts: self.choices.knobs.shortcuts,
             needs,
             exposures: self.choices.exposure.is_on,
-            depth: self.inputs.dataset.depth.is_some() || self.spec.depth.distortion() > 0.0,
+            depth: self.has_depth(),
             ..Setup::default()
         }
+    }
+
+    /// True if depth may be in the loss: if it is given, or if distortion has a weight.
+    pub(super) fn has_depth(&self) -> bool {
+        self.inputs.dataset.depth.is_some() || self.spec.depth.distortion() > 0.0
     }
 
     /// The maximum number of gradient records: two for every five pairs if the knob `pairs_per_row` is set, else

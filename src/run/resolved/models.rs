@@ -123,6 +123,7 @@ pub(crate) fn importance_setup(rows: usize, case: &Case<'_>, size: &RunSize) -> 
         // No gradient is computed, and moments are unused.
         record_cap: rows,
         storage: Storage { moments: MomentStorage::Both8, ..Storage::default() },
+        depth: false,
         ..case.backend_setup(size, needs)
     }
 }

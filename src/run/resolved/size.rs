@@ -325,7 +325,7 @@ fn pairs_of_image((width, height): (u32, u32)) -> usize {
 
 /// Maximum number of (row, tile) pairs that the backend supports at a time.
 fn max_pairs(case: &Case<'_>, rows: usize) -> Result<usize, Failure> {
-    Ok(case.inputs.device.most_pairs(&case.needs(rows)?, false))
+    Ok(case.inputs.device.most_pairs(&case.needs(rows)?, case.has_depth()))
 }
 
 /// The error if not even the smallest model fits: the memory that it takes, and verified changes of options with which
