@@ -384,3 +384,6 @@ impl Inspect for GpuBackend {
         rendering
     }
 }
+
+#[cfg(test)]
+mod tests;

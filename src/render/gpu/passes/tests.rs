@@ -160,14 +160,14 @@ fn a_step_has_the_known_dispatches_barriers_and_bytes() {
     let found: Vec<_> = counter.stages.iter().map(row).collect();
     // Dispatches, barriers, bytes per row, per entry, per pixel.
     let expected = [
-        "project: 1, 0, 290, 0, 0",
-        "sort by depth: 12, 12, 0, 0, 0",
-        "tiles: 11, 11, 0, 0, 0",
-        "rasterize: 1, 1, 0, 0, 0",
-        "loss: 6, 6, 0, 0, 0",
-        "rasterize_bwd: 2, 2, 0, 0, 0",
-        "project_bwd: 2, 2, 0, 0, 0",
-        "adam: 5, 5, 0, 0, 0",
+        "project: 1, 0, 288, 0, 0",
+        "sort by depth: 12, 12, 372, 76, 0",
+        "tiles: 11, 11, 220, 52, 0",
+        "rasterize: 1, 1, 40, 4, 24",
+        "loss: 6, 6, 240, 0, 128",
+        "rasterize_bwd: 2, 2, 120, 4, 24",
+        "project_bwd: 2, 2, 416, 0, 0",
+        "adam: 5, 4, 1171, 0, 0",
     ];
     assert_eq!(found, expected);
     let dispatches: u32 = counter.stages.iter().map(|stage| stage.dispatches).sum();
