@@ -95,7 +95,7 @@ fn steps_with_many_blocks_agree_with_the_native_backend() {
                 assert!(found.visible.abs_diff(expected.visible) <= 2, "{case}: {found:?}");
                 // Blocks of tiles bound large footprints less closely than the native backend does.
                 let more = found.entries as f64 / expected.entries as f64;
-                assert!((0.98..1.02).contains(&more), "{case}: {found:?}");
+                assert!((0.98..1.1).contains(&more), "{case}: {found:?}, {expected:?}");
                 assert_eq!(found.bands > 1, tile_cap.is_some(), "{case}");
                 assert!((found.loss - expected.loss).abs() < 1e-5, "{case}: {found:?}");
                 let stepped = gpu.download().expect("a model");
