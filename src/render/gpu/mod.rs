@@ -386,3 +386,6 @@ impl Inspect for GpuBackend {
         rendering
     }
 }
+
+#[cfg(test)]
+mod tests;
