@@ -42,6 +42,8 @@ fn step(backend: &mut dyn Backend, camera: &Camera, target: &Image8) -> StepOutp
         target,
         background: BACKGROUND,
         exposure: None,
+        depth: None,
+        distortion: 0.0,
         sh_degree: 1,
         rates,
         loss_terms: LossTerms::default(),
