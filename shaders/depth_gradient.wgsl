@@ -1,25 +1,20 @@
-// Depth in the loss, between stages 4 and 5: its value, and the channel that the backward pass differentiates.
+// Depth in the loss, after stage 3: its value, and the channel that the backward pass differentiates.
 // src/render/cpu/depth_gradient.rs derives the formulas.
 //
-// The channel takes two planes: the centre, whose sign is negative if the factor in the other plane is that of a
-// square. The gradient with respect to alpha is a multiple of the factor.
+// The channel has two numbers per pixel, which follow those of rasterize.wgsl in `finish`: the centre, which is negative
+// if the second number, a factor, is that of a square. The gradient with respect to alpha is a multiple of the factor.
 
 @group(0) @binding(1) var<storage, read_write> state: State;
 @group(0) @binding(2) var<storage, read_write> canvas: array<vec4<f32>>;
 // See rasterize.wgsl.
-@group(0) @binding(3) var<storage, read> finish: array<vec2<u32>>;
+@group(0) @binding(3) var<storage, read_write> finish: array<vec2<u32>>;
 // Weights of the pixels, one byte each.
 @group(0) @binding(4) var<storage, read> mask: array<u32>;
 // Per pixel, 16 bits each: given inverse depth in multiples of its unit, and confidence times mask in units of 1/255².
 // Both are 0 where no depth is given.
 @group(0) @binding(5) var<storage, read> given_depth: array<u32>;
-// dL/dpixel.
-@group(0) @binding(6) var<storage, read_write> gradient: array<f32>;
 // Sums of the depth term per group of pixels.
-@group(0) @binding(7) var<storage, read_write> depth_sums: array<f32>;
-
-// The first plane of depth in the loss.
-override DEPTH_PLANE: u32 = 0;
+@group(0) @binding(6) var<storage, read_write> depth_sums: array<f32>;
 
 // See loss.wgsl.
 const HAS_MASK: u32 = 2u;
@@ -81,9 +76,7 @@ fn differentiate(at: u32) -> f32 {
         centre = -expected;
         factor = bitcast<f32>(launch.a) * weight_of(at) / expected / expected;
     }
-    let first = DEPTH_PLANE * frame.image.x * frame.image.y;
-    gradient[first + at] = centre;
-    gradient[first + frame.image.x * frame.image.y + at] = factor;
+    finish[frame.image.x * frame.image.y + at] = bitcast<vec2<u32>>(vec2(centre, factor));
     return value;
 }
 

@@ -3,14 +3,11 @@
 
 @group(0) @binding(6) var<storage, read> finish: array<vec2<u32>>;
 // Planes of dL/dpixel: red, green, blue, and, if MORE is set, alpha and depth. If MORE is not set, a plane of
-// the pixels' errors follows, provided that records have a sum of errors; and from DEPTH_PLANE on, if records have a
-// gradient of depth, the two planes of depth_gradient.wgsl.
+// the pixels' errors follows, provided that records have a sum of errors.
 @group(0) @binding(7) var<storage, read> pixel_gradient: array<f32>;
 
 // True if alpha and depth have gradients.
 override MORE: bool = false;
-// The first plane of depth in the loss.
-override DEPTH_PLANE: u32 = 0;
 
 // dL/dpixel of an invocation's pixels; 0 outside the image.
 struct Upstream {
@@ -56,11 +53,17 @@ fn upstream(quad: Quad) -> Upstream {
         g.error = plane(3u, quad);
     }
     if DEPTH_AT > 0u && (frame.draw.w & INVERSE_DEPTH) != 0u {
-        let centre = plane(DEPTH_PLANE, quad);
-        let factor = plane(DEPTH_PLANE + 1u, quad);
-        g.centre = abs(centre);
-        g.depth = select(factor, zero, centre < zero);
-        g.square = select(zero, factor, centre < zero);
+        // See depth_gradient.wgsl.
+        for (var p = 0u; p < 4u; p++) {
+            if quad.inside[p] {
+                let at = frame.image.x * frame.image.y + quad.place[p];
+                let channel = bitcast<vec2<f32>>(finish[at]);
+                let is_square = channel.x < 0.0;
+                g.centre[p] = abs(channel.x);
+                g.depth[p] = select(channel.y, 0.0, is_square);
+                g.square[p] = select(0.0, channel.y, is_square);
+            }
+        }
         g.alpha = bitcast<f32>(frame.frozen.w) * g.depth;
     }
     return g;

@@ -15,7 +15,7 @@ impl GpuBackend {
         let loss = DepthLoss::new(input, self.near, self.sizes.depth, |map, mask| {
             confidence_in(map, mask, 0..map.inverse.len())
         })?;
-        // The gradient has planes of alpha and depth instead once `differentiate` has been called.
+        // Gradients of alpha and depth replace the channel once `differentiate` has been called.
         assert!(!self.sizes.alpha_and_depth, "a step with depth after a differentiation");
         frame.draw[3] |= target::INVERSE_DEPTH;
         if let Some(map) = loss.map {

@@ -216,7 +216,7 @@ pub(super) fn rebound(formats: Formats) -> HashMap<&'static str, Vec<Vec<Rebindi
         ("emit_entries", two(&|i| vec![("keys out", KEYS[0]), ("values out", emitted(i))])),
         ("similarity", vec![vec![("gradient", "pixel gradient")]]),
         ("pixel_gradient", vec![vec![("gradient", "pixel gradient")]]),
-        ("depth_gradient", vec![vec![("gradient", "pixel gradient"), ("depth sums", "tile sums")]]),
+        ("depth_gradient", vec![vec![("depth sums", "tile sums")]]),
         ("total_depth", vec![vec![("depth sums", "tile sums")]]),
         ("expose_bwd", vec![vec![("gradient", "pixel gradient")]]),
         ("adam_band", (0..4).map(|band| adam(1 + band)).collect()),

@@ -223,7 +223,7 @@ fn launches(
     let variant = Variant {
         records,
         alpha_and_depth,
-        depth_plane: sizes.depth.then(|| sizes.depth_plane()),
+        depth: sizes.depth,
         shortcuts,
         formats: sizes.formats(),
         counts_dominant,

@@ -17,8 +17,8 @@ pub(super) struct Variant {
     pub(super) records: RecordLayout,
     /// True if gradients of alpha and depth are computed too.
     pub(super) alpha_and_depth: bool,
-    /// The first plane of depth in the loss, if there may be any.
-    pub(super) depth_plane: Option<u64>,
+    /// True if depth may be in the loss.
+    pub(super) depth: bool,
     pub(super) shortcuts: Shortcuts,
     pub(super) formats: Formats,
     /// True if the pixels that each row dominates are counted.
@@ -32,8 +32,7 @@ impl Variant {
         let mut all = vec![
             ("RECORD".to_owned(), self.records.stride() as f64),
             ("MORE".to_owned(), f64::from(u8::from(self.alpha_and_depth))),
-            ("DEPTH_IN_LOSS".to_owned(), f64::from(u8::from(self.depth_plane.is_some()))),
-            ("DEPTH_PLANE".to_owned(), self.depth_plane.unwrap_or(0) as f64),
+            ("DEPTH_IN_LOSS".to_owned(), f64::from(u8::from(self.depth))),
             ("COUNTS_DOMINANT".to_owned(), f64::from(u8::from(self.counts_dominant))),
             ("BLUR".to_owned(), f64::from(self.antialiasing.kernel())),
             ("LOWERS_OPACITY".to_owned(), f64::from(u8::from(self.antialiasing.is_on()))),

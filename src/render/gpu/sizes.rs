@@ -134,16 +134,6 @@ impl Sizes {
         }
     }
 
-    /// The planes of an image gradient in front of those of depth in the loss, and the number of the latter.
-    pub(super) fn depth_plane(&self) -> u64 {
-        let errors = u64::from(self.records.has(Field::Error));
-        3 + errors * (1 + u64::from(self.with_edges))
-    }
-
-    fn depth_planes(&self) -> u64 {
-        2 * u64::from(self.depth)
-    }
-
     /// True if gradients may be summed over several iterations before an optimiser step: `[geometry and band 0, bands
     /// 1–3]`.
     pub(super) fn may_wait(&self) -> [bool; 2] {
@@ -243,9 +233,12 @@ impl Sizes {
         add(Section::Tiles, "tiles", "tile starts", 4 * (tiles + 1));
         add(Section::Tiles, "tiles", "tile counts", 4 * tiles);
         add(Section::Renderer, "image and image gradient", "canvas", 16 * pixels);
-        add(Section::Renderer, "image and image gradient", "finish", 8 * pixels);
+        // Followed by the channel of depth.
+        let finish = if self.depth { 16 } else { 8 };
+        add(Section::Renderer, "image and image gradient", "finish", finish * pixels);
+        let errors = u64::from(self.records.has(Field::Error));
         let channels =
-            if self.alpha_and_depth { 5 } else { self.depth_plane() + self.depth_planes() };
+            if self.alpha_and_depth { 5 } else { 3 + errors * (1 + u64::from(self.with_edges)) };
         add(Section::Renderer, "image and image gradient", "pixel gradient", 4 * channels * pixels);
         if self.depth {
             add(Section::Images, "given depth on the device", "given depth", 4 * pixels);

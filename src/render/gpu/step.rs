@@ -64,18 +64,18 @@ impl GpuBackend {
                 passes.place_depth(to, pixels);
             }
             passes.forward(to);
+            if let Some(DepthLoss { distortion, least_inverse, weight, by_transmittance, .. }) =
+                depth
+            {
+                let numbers = [distortion, least_inverse, weight, by_transmittance];
+                passes.depth_gradient(to, pixels, numbers);
+            }
             if exposure.is_some() {
                 passes.expose(to, pixels);
             }
             passes.loss(to, [weights, signal_weights]);
             if exposure.is_some() {
                 passes.expose_bwd(to, pixels);
-            }
-            if let Some(DepthLoss { distortion, least_inverse, weight, by_transmittance, .. }) =
-                depth
-            {
-                let numbers = [distortion, least_inverse, weight, by_transmittance];
-                passes.depth_gradient(to, pixels, numbers);
             }
         };
         let step = |passes: &Passes<'_>, to: &mut Recorder<'_>| {

@@ -65,7 +65,6 @@ fn device_allocations_match_the_ledger() {
         assert_eq!(&device.memory_plan(model.sh_degree, &options), gpu.ledger());
         gpu.render(&camera, BLUE, 1).expect("a rendering");
         assert_eq!(gpu.allocated_bytes(), promised);
-        // Per pixel: what is given, and two planes of the gradient, each buffer in whole powers of two or 16 bytes.
         let given = gpu.ledger().lines.iter().find(|line| line.what == "given depth on the device");
         assert_eq!(given.map(|line| line.bytes), depth.then_some(4 * 40 * 30));
         // Only accumulation in slots needs records.

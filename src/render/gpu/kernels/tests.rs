@@ -90,7 +90,7 @@ fn every_override_has_a_value_and_every_signal_a_number() {
     let variant = Variant {
         records: RecordLayout::DIFFERENTIATED,
         alpha_and_depth: true,
-        depth_plane: None,
+        depth: true,
         shortcuts: Shortcuts::default(),
         antialiasing: Antialiasing::Wide,
         formats: SLOTS,
