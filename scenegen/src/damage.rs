@@ -250,10 +250,8 @@ mod tests {
         let shifted = damaged(Damage { shift: [2, -1], ..Damage::default() });
         let at = |x: u32, y: u32| shifted[(y * SIDE + x) as usize];
         // The column without depth has moved, and what lies outside is unknown.
-        assert_eq!(
-            [at(0, 5), at(1, 5), at(2, 5), at(3, 5), at(9, SIDE - 1)],
-            [0.0, 0.0, 0.0, 2.0, 0.0]
-        );
+        let is_known = [(0, 5), (1, 5), (2, 5), (3, 5), (9, SIDE - 1)].map(|(x, y)| at(x, y) > 0.0);
+        assert_eq!(is_known, [false, false, false, true, false]);
     }
 
     #[test]

@@ -151,24 +151,22 @@ impl<'a> DepthLoss<'a> {
                 let slope = self.weight * by_distance / if is_seen { alpha } else { 1.0 };
                 let slope = if error < 0.0 { -slope } else { slope };
                 let is_off = is_seen & (error != 0.0);
-                let found = PixelDepth {
+                PixelDepth {
                     value: if is_seen { by_distance * error.abs() } else { 0.0 },
                     centre: expected,
                     by_depth: if is_off { slope } else { 0.0 },
                     ..PixelDepth::default()
-                };
-                found
+                }
             }
             DepthTerm::Samples => {
                 let by_transmittance = confidence * self.by_transmittance;
-                let found = PixelDepth {
+                PixelDepth {
                     value: by_distance * sum + by_transmittance * transmittance,
                     centre: if is_known { inverse } else { expected },
                     by_depth: self.weight * by_distance,
                     by_alpha: -self.weight * by_transmittance,
                     square: 0.0,
-                };
-                found
+                }
             }
         };
         let has_square = is_seen & !is_known & (expected >= self.least_inverse);

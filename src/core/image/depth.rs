@@ -150,14 +150,9 @@ mod tests {
         let inverse: Vec<f32> = depths.iter().map(|z| 1.0 / z).collect();
         let map =
             DepthMap::quantised((3, 2), &inverse, vec![255, 100, 255, 255, 255, 255]).unwrap();
-        for pixel in 0..3 {
+        for (pixel, depth) in depths[..3].iter().enumerate() {
             let [x, confidence] = map.inverse_depth(pixel);
-            assert!(
-                (1.0 / x / depths[pixel] - 1.0).abs() < 0.002,
-                "{} for {}",
-                1.0 / x,
-                depths[pixel]
-            );
+            assert!((1.0 / x / depth - 1.0).abs() < 0.002, "{} for {depth}", 1.0 / x);
             assert!(confidence > 0.3);
         }
         // Too near, unknown (infinitely near), and not a number.

@@ -102,27 +102,7 @@ pub(super) fn assemble(
         }
     }
     view_list.map_or(Ok(()), |list| list.check(&train))?;
-    if train.is_empty() && test.is_empty() && !hidden_names.is_empty() {
-        let ignored = if options.invert_masks { "white" } else { "black" };
-        let problem = format!(
-            "no view is left to train on: masks hide every pixel of all {} views ({ignored} is \
-             ignored)",
-            hidden_names.len()
-        );
-        let remedy = LoadRemedy::InvertMasks(!options.invert_masks);
-        return Err(LoadError::Remedied { problem, remedy });
-    }
-    if let Some(shown) = first_names(&hidden_names) {
-        notes.push(Note::Text(format!(
-            "masks hide every pixel of {} views, which are left out: {shown}",
-            hidden_names.len()
-        )));
-    }
-    if train.is_empty() {
-        let problem =
-            format!("no view is left to train on: the test split takes all {} views", test.len());
-        return Err(LoadError::Remedied { problem, remedy: LoadRemedy::LargerTestEvery });
-    }
+    check_left(&train, &test, &hidden_names, options, &mut notes)?;
     let points_path = points_file.as_deref().unwrap_or(path);
     drop_points(points_path, &mut points, &mut notes, "finite", DVec3::is_finite)?;
     let normalisation = Normalisation::fit(&near, &points.positions);
@@ -173,6 +153,38 @@ pub(super) fn assemble(
         depth,
         notes,
     })
+}
+
+/// Fails if no view is left to train on; notes the views that masks hide.
+fn check_left(
+    train: &[View],
+    test: &[View],
+    hidden_names: &[String],
+    options: &LoadOptions,
+    notes: &mut Vec<Note>,
+) -> Result<(), LoadError> {
+    if train.is_empty() && test.is_empty() && !hidden_names.is_empty() {
+        let ignored = if options.invert_masks { "white" } else { "black" };
+        let problem = format!(
+            "no view is left to train on: masks hide every pixel of all {} views ({ignored} is \
+             ignored)",
+            hidden_names.len()
+        );
+        let remedy = LoadRemedy::InvertMasks(!options.invert_masks);
+        return Err(LoadError::Remedied { problem, remedy });
+    }
+    if let Some(shown) = first_names(hidden_names) {
+        notes.push(Note::Text(format!(
+            "masks hide every pixel of {} views, which are left out: {shown}",
+            hidden_names.len()
+        )));
+    }
+    if train.is_empty() {
+        let problem =
+            format!("no view is left to train on: the test split takes all {} views", test.len());
+        return Err(LoadError::Remedied { problem, remedy: LoadRemedy::LargerTestEvery });
+    }
+    Ok(())
 }
 
 /// Note about views whose camera is far from all others.

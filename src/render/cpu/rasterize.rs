@@ -56,7 +56,7 @@ pub(super) enum DepthPlane<'a> {
 }
 
 /// Planes of a rendered tile: red, green, blue, final transmittance, depth. Before the backward pass of a step with
-/// depth in its loss, [`depth_gradient`](super::depth_gradient) replaces all but the transmittance.
+/// depth in its loss, [`depth_gradient`](super::depth_gradient) replaces red, green and depth.
 pub(super) const CANVAS_PLANES: usize = 5;
 pub(super) const TRANSMITTANCE: usize = 3;
 pub(super) const DEPTH: usize = 4;

@@ -389,3 +389,6 @@ impl Inspect for GpuBackend {
         rendering
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -8,7 +8,7 @@ use glam::DVec3;
 use super::case::{Case, DECODERS};
 use super::fit::RunSize;
 use super::geometry_measurement::GeometryMeasurement;
-use super::models::{first_bytes, first_bytes_on_device, reading_bytes};
+use super::models::{add_first_model, reading_bytes};
 use crate::companion::CompanionSize;
 use densify_core::antialiasing::Antialiasing;
 use densify_core::gaussians::sh_coefficients;
@@ -121,12 +121,7 @@ impl Case<'_> {
             ledger.add_to(Section::Before, "colours of tracks", bytes);
         }
         if let Some(model) = self.inputs.init_model {
-            let bytes = first_bytes(model, self, size, threads);
-            ledger.add_to(Section::Before, "the model it starts from", bytes);
-            let bytes = first_bytes_on_device(model, self, size, threads);
-            if bytes > 0 {
-                ledger.add_on_device(Section::Before, "importance of its rows", bytes);
-            }
+            add_first_model(&mut ledger, model, self, size, threads);
         }
         if let Some(model) = self.inputs.frozen_model {
             ledger.add_to(Section::Before, "the frozen model", reading_bytes(model));

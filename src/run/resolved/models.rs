@@ -10,7 +10,7 @@ use crate::models::{is_model, iteration_so_far, read_model};
 use crate::observer::Observer;
 use crate::spec::AbsolutePath;
 use densify_core::gaussians::{Gaussians, sh_coefficients};
-use densify_core::memory::Ledger;
+use densify_core::memory::{Ledger, Section};
 use densify_render::{MomentStorage, Setup, Storage};
 use densify_train::importance::needs;
 use densify_train::output::{CONFIG_FILE, model_path, saved_iterations};
@@ -73,14 +73,25 @@ pub(super) fn reading_bytes(model: ModelSize) -> u64 {
     3 * bytes_of(model)
 }
 
-/// Peak bytes for the model of `--init` before training: while it is read, or, if it exceeds the budget, while its
-/// importance is measured.
-pub(super) fn first_bytes(
+/// Adds the memory for the model of `--init` before training.
+pub(super) fn add_first_model(
+    ledger: &mut Ledger,
     model: ModelSize,
     case: &Case<'_>,
     size: &RunSize,
     threads: usize,
-) -> u64 {
+) {
+    let bytes = first_bytes(model, case, size, threads);
+    ledger.add_to(Section::Before, "the model it starts from", bytes);
+    let bytes = first_bytes_on_device(model, case, size, threads);
+    if bytes > 0 {
+        ledger.add_on_device(Section::Before, "importance of its rows", bytes);
+    }
+}
+
+/// Peak bytes for the model of `--init` before training: while it is read, or, if it exceeds the budget, while its
+/// importance is measured.
+fn first_bytes(model: ModelSize, case: &Case<'_>, size: &RunSize, threads: usize) -> u64 {
     let reading = reading_bytes(model);
     if model.rows <= case.budget(size.rows).trainable() {
         return reading;
@@ -100,12 +111,7 @@ fn importance_ledger(model: ModelSize, case: &Case<'_>, size: &RunSize, threads:
 }
 
 /// Bytes on the device while the importance of the model of `--init` is measured; 0 if it is within the budget.
-pub(super) fn first_bytes_on_device(
-    model: ModelSize,
-    case: &Case<'_>,
-    size: &RunSize,
-    threads: usize,
-) -> u64 {
+fn first_bytes_on_device(model: ModelSize, case: &Case<'_>, size: &RunSize, threads: usize) -> u64 {
     if model.rows <= case.budget(size.rows).trainable() {
         return 0;
     }

@@ -170,6 +170,41 @@ run_spec! {
         background: Background = Background::Black, Fixed, value "COLOUR";
     }
 
+    /// The dataset, and the first Gaussians.
+    start: StartSpec, "Scene" {
+        /// Folder or ZIP archive of the dataset, or scene:NAME for a built-in scene
+        #[arg(value_name = "SCENE")]
+        scene: Option<PathBuf> = None, Free;
+
+        /// Source of the first Gaussians: the dataset's points, random points, or a model (a file by any program, or a
+        /// run's folder) in the dataset's coordinates (default: points if the dataset has any, else random)
+        ///
+        /// If the model has more Gaussians than the budget, those that contribute most to the training views are kept.
+        /// Its colours are cut or extended to --sh-degree
+        init: Option<InitChoice> = None, Fixed, value "points|random|MODEL";
+
+        /// Learning rates of a run that starts from a model; --lr changes single rates
+        init_rates: InitRates = InitRates::Fine, Fixed, value "RATES";
+
+        /// A model in the dataset's coordinates (a file by any program, or a run's folder) whose Gaussians are rendered
+        /// but never change: they are neither trained, moved nor removed. The Gaussians of --init are trained beside
+        /// them; the budget counts frozen and trained Gaussians
+        freeze: Option<AbsolutePath> = None, Fixed, value "MODEL";
+
+        /// Lower the opacity of Gaussians smaller than a pixel, to make up for the kernel (0.3 or 0.1 px²) that widens
+        /// them, so that the model also suits other resolutions; none: no antialiasing (default: that of the model of
+        /// --init or --freeze, else none; without KERNEL: 0.3)
+        #[arg(num_args = 0..=1, require_equals = true, default_missing_value = "0.3")]
+        antialias: Option<Antialiasing> = None, Fixed, value "KERNEL";
+
+        /// Number of random points to start from (default: half the budget, at most 100k)
+        init_points: Option<Rows> = None, Fixed, value "N";
+
+        /// Smallest distance from a camera at which anything is rendered, as a fraction of the scene's
+        /// extent (default: 0.04, or less where the views show points that are nearer)
+        near: Option<Fraction> = None, Fixed, value "FRACTION";
+    }
+
     /// Depth given beside the photographs, and terms of the loss that need none.
     depth: DepthSpec, "Depth" {
         /// Use of depth maps that the dataset has: files named by depth_file_path in transforms.json; depth/ or depths/
@@ -204,41 +239,6 @@ run_spec! {
         /// Weight of a term that gathers the Gaussians along each ray, after a third of the run; needs no given depth
         /// (default: 0)
         distortion_weight: Option<Weight> = None, Fixed, value "WEIGHT";
-    }
-
-    /// The dataset, and the first Gaussians.
-    start: StartSpec, "Scene" {
-        /// Folder or ZIP archive of the dataset, or scene:NAME for a built-in scene
-        #[arg(value_name = "SCENE")]
-        scene: Option<PathBuf> = None, Free;
-
-        /// Source of the first Gaussians: the dataset's points, random points, or a model (a file by any program, or a
-        /// run's folder) in the dataset's coordinates (default: points if the dataset has any, else random)
-        ///
-        /// If the model has more Gaussians than the budget, those that contribute most to the training views are kept.
-        /// Its colours are cut or extended to --sh-degree
-        init: Option<InitChoice> = None, Fixed, value "points|random|MODEL";
-
-        /// Learning rates of a run that starts from a model; --lr changes single rates
-        init_rates: InitRates = InitRates::Fine, Fixed, value "RATES";
-
-        /// A model in the dataset's coordinates (a file by any program, or a run's folder) whose Gaussians are rendered
-        /// but never change: they are neither trained, moved nor removed. The Gaussians of --init are trained beside
-        /// them; the budget counts frozen and trained Gaussians
-        freeze: Option<AbsolutePath> = None, Fixed, value "MODEL";
-
-        /// Lower the opacity of Gaussians smaller than a pixel, to make up for the kernel (0.3 or 0.1 px²) that widens
-        /// them, so that the model also suits other resolutions; none: no antialiasing (default: that of the model of
-        /// --init or --freeze, else none; without KERNEL: 0.3)
-        #[arg(num_args = 0..=1, require_equals = true, default_missing_value = "0.3")]
-        antialias: Option<Antialiasing> = None, Fixed, value "KERNEL";
-
-        /// Number of random points to start from (default: half the budget, at most 100k)
-        init_points: Option<Rows> = None, Fixed, value "N";
-
-        /// Smallest distance from a camera at which anything is rendered, as a fraction of the scene's
-        /// extent (default: 0.04, or less where the views show points that are nearer)
-        near: Option<Fraction> = None, Fixed, value "FRACTION";
     }
 
     /// Limits of memory and quality.

@@ -55,7 +55,7 @@ pub(super) fn check(
         match first {
             None => empty += 1,
             Some(first) => {
-                constant += usize::from(source != DepthOrigin::Points && is_constant(first))
+                constant += usize::from(source != DepthOrigin::Points && is_constant(first));
             }
         }
         let counts = |(x, weight): &(&f32, &u8)| known(x) && **weight > 0;

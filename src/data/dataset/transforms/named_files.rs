@@ -77,16 +77,15 @@ pub(in super::super) fn usual_points(
 }
 
 impl Fields<'_> {
-    /// The depth file that a frame names, if depth is read. A missing file is not an error, as depth may be left out.
+    /// The depth file that a frame names, or else one with the name of the image, if depth is read. A missing file is not an error, as depth may be left out.
     pub(super) fn depth(
         &self,
         (root, folders): (&Root, &Folders),
         image: &ImageFile,
-        value: &str,
+        listed: DataPath<'_>,
     ) -> Result<Option<DepthFile>, LoadError> {
-        if !folders.reads_depth {
-            return Ok(None);
-        }
+        let value = self.text("depth_file_path")?.filter(|_| folders.reads_depth);
+        let Some(value) = value else { return folders.depth(image, listed) };
         let field = self.full("depth_file_path");
         let named = DataPath { file: self.path, field: &field, value };
         let found = if folders.folder_for_absolute(value).is_some() {
@@ -98,7 +97,7 @@ impl Fields<'_> {
         } else {
             root.existing_on_any_system(named)?
         };
-        let Some(path) = found else { return folders.depth(image, named) };
+        let Some(path) = found else { return folders.depth(image, listed) };
         let Some(depth) = DepthFile::new(path) else {
             let problem = format!("{value:?} is no PNG, NumPy or OpenEXR file");
             return Err(self.fault("depth_file_path", problem));
