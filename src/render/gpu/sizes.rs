@@ -371,7 +371,7 @@ mod tests {
         }
     }
 
-    /// All memory on the device per row, for a million rows and images of 1.6 megapixels: by default, with moments in
+    /// All memory on the device per row, for a million rows and images of 1.6 megapixels: with moments in f32 and in
     /// bytes, and with `--preset tiny-memory`. docs/memory.md has the figures.
     #[test]
     fn a_million_rows_take_the_documented_bytes() {

@@ -9,7 +9,7 @@ use densify_core::numbers::grouped;
 use densify_core::spelling::Spelling;
 use densify_data::dataset::Note;
 use densify_data::models::{Coarseness, offset_text};
-use densify_render::{Accumulation, AdapterKind, BackendKind, Device};
+use densify_render::{Accumulation, AdapterKind, BackendKind, Device, MomentStorage};
 
 /// The option `antialias` with a value; on the command line, the value must follow `=`.
 pub(crate) fn antialias_option(spelling: Spelling, kernel: Antialiasing) -> String {
@@ -72,6 +72,16 @@ pub(crate) fn dataset(s: Spelling, note: &Note) -> String {
             s.text("depth_unit", "relative")
         ),
     }
+}
+
+/// The line that names the storage of moments that a backend takes by default.
+pub(crate) fn moments(s: Spelling, taken: MomentStorage) -> String {
+    let name = match taken {
+        MomentStorage::F32 => "f32",
+        MomentStorage::Both8 => "both8",
+    };
+    let other = s.member("knob", "moment_storage", "f32");
+    format!("moments  moment_storage={name}: one byte each; {other} keeps them whole")
 }
 
 /// The line that names the order in which gradients are added up.

@@ -10,7 +10,7 @@ use super::config::{ModelSize, RunConfig};
 use super::degree::Degree;
 use super::exposure::Exposure;
 use super::fit::RunSize;
-use super::inputs::{Evidence, Inputs, Reading, open_device};
+use super::inputs::{Evidence, Inputs, Reading, choose_moments, open_device};
 use super::size::MIN_ROWS;
 use crate::failure::{Failure, ModelProblem, OptionProblem, SizeProblem};
 use crate::host::Host;
@@ -213,7 +213,9 @@ impl<'a> Case<'a> {
         let knobs = if spec.schedule.knob == self.spec.schedule.knob {
             self.choices.knobs.clone()
         } else {
-            spec.knobs()?
+            let mut knobs = spec.knobs()?;
+            choose_moments(&mut knobs, inputs.device.kind());
+            knobs
         };
         let (entry, parameters) = spec.policy()?;
         let choices = Choices { entry, parameters, knobs, degree, ..self.choices.clone() };

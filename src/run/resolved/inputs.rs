@@ -159,8 +159,7 @@ fn start_model(
     }
 }
 
-/// Opens the device, checks that it supports the knobs that are set, and sets the knob `accumulation` to the method in
-/// use.
+/// Opens the device, checks that it supports the knobs that are set, and sets the knobs whose defaults depend on it.
 pub(super) fn open_device(
     spec: &RunSpec,
     knobs: &mut Knobs,
@@ -182,7 +181,20 @@ pub(super) fn open_device(
             .map_err(|error| OptionProblem::value("knob", error))?;
         observer.say(format_args!("{}", notes::accumulation(observer.spelling(), method)));
     }
+    if choose_moments(knobs, device.kind()) {
+        observer
+            .say(format_args!("{}", notes::moments(observer.spelling(), knobs.storage.moments)));
+    }
     Ok(device)
+}
+
+/// Sets the knob `moment_storage` to the default of this backend, unless it is set or that is f32. Returns true if it
+/// was.
+pub(super) fn choose_moments(knobs: &mut Knobs, kind: BackendKind) -> bool {
+    let is_auto =
+        knobs.iter().any(|(knob, value)| knob.name == "moment_storage" && value == "auto");
+    let chooses = is_auto && kind == BackendKind::Gpu;
+    chooses && knobs.set("moment_storage", "both8").is_ok()
 }
 
 /// Fails if a knob is set that this backend does not have.
@@ -200,4 +212,27 @@ fn check_knobs(knobs: &Knobs, kind: BackendKind) -> Result<(), Failure> {
         }
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use densify_render::MomentStorage;
+
+    #[test]
+    fn moments_take_the_storage_of_the_backend_unless_it_is_set() {
+        for (given, kind, expected) in [
+            (None, BackendKind::Cpu, MomentStorage::F32),
+            (None, BackendKind::Gpu, MomentStorage::Both8),
+            (Some("f32"), BackendKind::Gpu, MomentStorage::F32),
+            (Some("both8"), BackendKind::Cpu, MomentStorage::Both8),
+        ] {
+            let mut knobs = Knobs::default();
+            if let Some(value) = given {
+                knobs.set("moment_storage", value).expect("a value of this knob");
+            }
+            choose_moments(&mut knobs, kind);
+            assert_eq!(knobs.storage.moments, expected, "{given:?} on {kind:?}");
+        }
+    }
 }

@@ -2,6 +2,7 @@
 
 use std::fs::File;
 use std::io::Read;
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::Path;
 
 use image::imageops;
@@ -68,7 +69,7 @@ pub(in super::super) fn read_header(
     match kind {
         DepthKind::Png => png::read_header(source),
         DepthKind::Npy => npy::read_header(source),
-        DepthKind::Exr => exr::read_header(source),
+        DepthKind::Exr => without_panic(source, exr::read_header),
         DepthKind::Colmap => colmap::read_header(source),
     }
 }
@@ -82,7 +83,7 @@ pub(in super::super) fn read(
     let mut values = match kind {
         DepthKind::Png => png::read(source, keeps_zero)?,
         DepthKind::Npy => npy::read(source)?,
-        DepthKind::Exr => exr::read(source)?,
+        DepthKind::Exr => without_panic(source, exr::read)?,
         DepthKind::Colmap => colmap::read(source)?,
     };
     for value in values.iter_mut() {
@@ -97,6 +98,15 @@ pub(in super::super) fn read(
         }
     }
     Ok(values)
+}
+
+/// Calls a decoder that may panic on damaged files, and turns a panic into an error.
+fn without_panic<T>(
+    source: &SourceFile,
+    read: impl FnOnce(&SourceFile) -> Result<T, LoadError>,
+) -> Result<T, LoadError> {
+    catch_unwind(AssertUnwindSafe(|| read(source)))
+        .unwrap_or_else(|_| Err(malformed(&source.path, "the file", "the decoder failed")))
 }
 
 /// The confidences of a depth map: 0 ignores a pixel, 255 counts it in full.

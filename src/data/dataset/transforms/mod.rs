@@ -179,12 +179,7 @@ fn read(
         format!("{name}: {count} of {all} frames have no image file and are skipped ({first} is the first{other})")
     });
     notes.extend(missing);
-    if let Some(first) = bad.first() {
-        let (count, all) = (bad.len(), listed.len());
-        notes.push(format!(
-            "{name}: {count} of {all} frames are marked is_bad and are left out (first: {first})"
-        ));
-    }
+    notes.extend(bad_note(name, &bad, listed.len()));
     if fell_back > 0 {
         notes.push(folders.fell_back_note(fell_back));
     }
@@ -200,6 +195,14 @@ fn read(
         scene.notes.extend(note.map(Note::Text));
     }
     Ok(scene)
+}
+
+/// Says how many of `all` frames are left out because the file marks them as bad, if any are.
+fn bad_note(name: &str, bad: &[&str], all: usize) -> Option<String> {
+    let (first, count) = (bad.first()?, bad.len());
+    Some(format!(
+        "{name}: {count} of {all} frames are marked is_bad and are left out (first: {first})"
+    ))
 }
 
 /// Refuses an image that is both trained on and tested on.

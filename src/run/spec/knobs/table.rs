@@ -69,12 +69,12 @@ pub static KNOBS: &[Knob] = &[
     },
     Knob {
         name: "moment_storage",
-        default: "f32",
-        domain: Domain::Choice(&["f32", "both8"]),
+        default: "auto",
+        domain: Domain::Choice(&["auto", "f32", "both8"]),
         unit: "",
         only_on: None,
         class: Bounded,
-        effect: "both8: each of the optimiser's two moments in one byte",
+        effect: "both8: each of the optimiser's two moments in one byte; auto: both8 on a GPU, else f32",
         levels: &["both8"],
         set: |knobs, value| {
             knobs.storage.moments = match value {

@@ -48,7 +48,7 @@ fn values_out_of_range_are_refused_with_the_nearest_that_works() {
         ("alpha_min=NaN", ["alpha_min", "NaN", "works is 1/255"]),
         ("transmittance_stop=1", ["transmittance_stop", "1e-5 to 1e-2", "works is 1e-2"]),
         ("pairs_per_row=4.4", ["pairs_per_row", "auto|4|2|1", "works is 4"]),
-        ("moment_storage=bf16", ["moment_storage", "f32|both8", "works is"]),
+        ("moment_storage=bf16", ["moment_storage", "auto|f32|both8", "works is"]),
         ("alpha_mim=1/64", ["alpha_mim", "alpha_min", "densify knobs"]),
     ] {
         let message = canonical(setting).unwrap_err().to_string();
