@@ -240,7 +240,7 @@ fn maps_of_other_views_are_refused() {
     assert!(problem.contains("other views"), "{problem}");
     assert_eq!(remedy, Some(DepthRemedy::OtherViews));
     let turned = Room::new();
-    turned.edit(|view, [x, y], _| maps[view][(x, SIDE - 1 - y)].0[0] / 1000.0);
+    turned.edit(|view, [x, y], _| maps[view][(SIDE - 1 - x, SIDE - 1 - y)].0[0] / 1000.0);
     assert_eq!(turned.refusal(on()).1, Some(DepthRemedy::OtherViews));
 }
 
@@ -491,7 +491,7 @@ fn points_become_sparse_depth() {
         std::fs::write(&path, header + &rows.collect::<String>()).unwrap();
         DepthOptions { points: Some(path), ..on() }
     };
-    let refused = |options| match room.load(&with(options)).unwrap_err() {
+    let refused = |options| match room.load(&with(options)).map(|data| data.depth).unwrap_err() {
         LoadError::Remedied { problem, remedy: LoadRemedy::Depth(remedy) } => (problem, remedy),
         other => panic!("{other}"),
     };
