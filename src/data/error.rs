@@ -80,6 +80,16 @@ pub enum DepthRemedy {
     NotRelative,
     /// Register depth and colour.
     Register,
+    /// Give each map the name of its photograph.
+    OtherViews,
+    /// Move the point cloud to the coordinates of the dataset.
+    Align,
+    /// Correct the scales and offsets in `depth_params.json`.
+    Params,
+    /// Reconstruct more points.
+    MorePoints,
+    /// Leave the depth out, as the problem already says what else helps.
+    LeaveOut,
 }
 
 impl LoadError {

@@ -30,12 +30,6 @@ impl DepthMap {
         [f32::from(self.inverse[pixel]) * self.unit, f32::from(confidence) / 255.0]
     }
 
-    /// Sum of the confidences of all pixels with a known depth.
-    pub fn total_confidence(&self) -> f32 {
-        let known = self.inverse.iter().zip(&self.confidence).filter(|&(&inverse, _)| inverse > 0);
-        known.map(|(_, &confidence)| u64::from(confidence)).sum::<u64>() as f32 / 255.0
-    }
-
     /// A map from inverse depths `[1/scene units]`, where values that are not positive and finite are unknown, and
     /// confidences. `None` if no depth is known. Depths below a 64th of the median count as unknown, so that a stray
     /// near value does not make all others coarse: one step of `inverse` is then at most 0.1 % of the median depth.

@@ -65,8 +65,12 @@ pub(super) fn load(path: &Path, options: &LoadOptions) -> Result<Dataset, LoadEr
     let mut dataset = Dataset::load_folder(&unpacked.folder, options)
         .map_err(|error| unpacked.error_with_archive_name(error))?;
     for note in &mut dataset.notes {
-        if let Note::Text(text) = note {
-            *text = unpacked.with_archive_name(text);
+        match note {
+            Note::Text(text) => *text = unpacked.with_archive_name(text),
+            Note::DepthLeftOut(error) => {
+                **error = unpacked.error_with_archive_name((**error).clone());
+            }
+            _ => {}
         }
     }
     let (bytes, folder) = (Bytes(unpacked.bytes), unpacked.temporary.path().display());
@@ -140,7 +144,7 @@ impl Unpacked {
     }
 
     /// Replaces the temporary folder with the archive's name in an error.
-    fn error_with_archive_name(&self, error: LoadError) -> LoadError {
+    pub(super) fn error_with_archive_name(&self, error: LoadError) -> LoadError {
         match error {
             LoadError::Data(problem) => LoadError::Data(self.with_archive_name(&problem)),
             LoadError::Remedied { problem, remedy } => {

@@ -128,6 +128,8 @@ pub enum Note {
         /// Number of photographs that are cropped noticeably.
         photographs: usize,
     },
+    /// A view is trained without its depth because of this fault, which was met in training.
+    DepthDropped(Box<LoadError>),
     /// Depth was found, but is not used because of this fault.
     DepthLeftOut(Box<LoadError>),
     /// The scale of depth differs between views, which fitting each of them to its points would correct.
@@ -181,7 +183,8 @@ struct Frame {
     /// Divisor K of the folder `images_K` that contains the image.
     reduced: Option<u32>,
     mask: Option<MaskFile>,
-    depth: Option<DepthFile>,
+    /// The file of its depth, if there is one; a fault does not concern runs without depth.
+    depth: Result<Option<DepthFile>, LoadError>,
     lens: Lens,
     /// Header of the image, if the pose file states no image size; the lens then has the size of the image.
     header: Option<ImageHeader>,
@@ -191,6 +194,18 @@ struct Frame {
 }
 
 impl Dataset {
+    /// Faults of depth maps met in training since the last call, which cost only the depth of their views. Each is
+    /// returned once.
+    pub fn take_depth_faults(&self) -> Vec<Note> {
+        let depth = self.train.iter().find_map(|view| view.source.depth.as_ref());
+        let faults = depth.map_or_else(Vec::new, |depth| depth.take_faults());
+        let named = |fault| match &self.unpacked {
+            Some(unpacked) => unpacked.error_with_archive_name(fault),
+            None => fault,
+        };
+        faults.into_iter().map(|fault| Note::DepthDropped(Box::new(named(fault)))).collect()
+    }
+
     /// Loads the dataset in the folder or ZIP archive `path`, or the built-in scene `scene:NAME` (see [`builtin`]).
     /// Images are checked by their headers; their pixels are read later, through [`images::ImageCache`].
     ///

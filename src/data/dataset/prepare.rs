@@ -52,11 +52,13 @@ pub(super) fn assemble(
 ) -> Result<Dataset, LoadError> {
     let Scene { listing, mut points, mut points_file, tracks, own_split, surface_bytes, .. } =
         scene;
+    let mut is_seeded = false;
     if points.is_empty()
         && let Some(cloud) = first_points(options)?
     {
         points = cloud;
         points_file.clone_from(&options.depth.points);
+        is_seeded = true;
     }
     let surface_bytes = surface_bytes.or_else(|| super::builtin::surface_bytes(path));
     let centres: Vec<_> =
@@ -134,6 +136,7 @@ pub(super) fn assemble(
             points: &points,
             normalisation: &normalisation,
             is_truth: surface_bytes.is_some(),
+            is_seeded,
             fault: depth_fault,
         },
         options,

@@ -138,7 +138,7 @@ fn read(root: &Root, options: &LoadOptions) -> Result<Option<Scene>, LoadError> 
         let (rotation, translation) = row.pose(&origin)?;
         let (lens, header) = row.lens(&origin, &found.path, found.reduced)?;
         let mask = folders.mask(&found, named, &photographs)?;
-        let depth = folders.depth(&found, named)?;
+        let depth = folders.depth(&found, named);
         frames.push(Frame {
             name: found.name,
             id: None,

@@ -63,6 +63,9 @@ pub(crate) fn dataset(s: Spelling, note: &Note) -> String {
              field of view)",
             s.switch("keep_fov")
         ),
+        Note::DepthDropped(error) => {
+            format!("warning: a view is trained without its depth: {}", load_error(error, s))
+        }
         Note::DepthLeftOut(error) => {
             format!("note: the given depth is not used: {}", load_error(error, s))
         }

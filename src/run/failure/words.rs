@@ -72,6 +72,15 @@ fn depth_remedy(remedy: DepthRemedy, s: Spelling) -> String {
         DepthRemedy::Relative => format!("fit them with {}", s.text("depth_unit", "relative")),
         DepthRemedy::NotRelative => format!("state their unit with {}", s.option("depth_unit")),
         DepthRemedy::Register => "register depth and photographs first".to_owned(),
+        DepthRemedy::OtherViews => {
+            "check that each map has the name of its photograph, and that none is turned".to_owned()
+        }
+        DepthRemedy::Align => "move the cloud to the coordinates of the dataset".to_owned(),
+        DepthRemedy::Params => "write depth_params.json again for this model".to_owned(),
+        DepthRemedy::MorePoints => "reconstruct the scene with more points".to_owned(),
+        DepthRemedy::LeaveOut => {
+            return format!("or train without depth with {}", s.text("depth", "off"));
+        }
     };
     format!("{words}, or train without depth with {}", s.text("depth", "off"))
 }

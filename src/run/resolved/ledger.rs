@@ -253,8 +253,10 @@ impl Case<'_> {
         let views = train.iter().chain(test);
         let rendered = |view: &View| view.source.rendered.as_ref().map_or(0, |image| image.bytes());
         // A view's name and path, in the dataset and again for its images.
-        let depth =
-            |view: &View| view.source.depth.as_ref().map_or(0, |depth| 3 * depth.held_bytes());
+        let depth = |view: &View| {
+            let depth = view.source.depth.as_ref();
+            depth.map_or(0, |depth| 3 * depth.held_bytes() + depth.pixel_bytes())
+        };
         let view = |view: &View| {
             // A view's depth is counted with the depth, so that runs without depth need no more memory than before it
             // existed.

@@ -23,7 +23,7 @@ use cpu_time::ProcessTime;
 use glam::DVec3;
 
 use crate::failure::{Failure, INPUT, OTHER, TrainingProblem};
-use crate::observer::{Interrupt, NextAction, Observer};
+use crate::observer::{Interrupt, NextAction, Observer, say_notes};
 use densify_core::files::{FileError, write_atomically};
 use densify_data::models::{PLY, Shape};
 use densify_data::views::ViewSource;
@@ -351,6 +351,7 @@ impl<'a> Session<'a> {
         // The original end of an extended run has a record, too, so that records do not depend on the extension.
         let ends = [run.spec.schedule.iterations.0, run.last].contains(&step);
         if step.is_multiple_of(RECORD_EVERY) || ends {
+            say_notes(*observer, &run.dataset.take_depth_faults());
             let record = totals.record(step, report.rows, (run.process.resident)());
             observer.recorded(&record);
             logs.steps.append(&record)?;

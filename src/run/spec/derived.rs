@@ -59,17 +59,23 @@ impl RunSpec {
     /// depth that an earlier session of the run has taken.
     pub(crate) fn load_options(&self, tracks: bool, is_known: Option<bool>) -> LoadOptions {
         let DepthSpec { depth, depth_unit, depth_along, depth_points, .. } = &self.depth;
+        // A cloud that is named is meant to be used.
+        let wanted = match depth.unwrap_or(DepthChoice::Auto) {
+            DepthChoice::Auto if depth_points.is_some() => DepthChoice::On,
+            wanted => wanted,
+        };
         let choice = match is_known {
             _ if self.depth.training().is_none() => DepthChoice::Off,
             Some(true) => DepthChoice::On,
             Some(false) => DepthChoice::Off,
-            None => depth.unwrap_or(DepthChoice::Auto),
+            None => wanted,
         };
         let depth = DepthOptions {
             choice,
             unit: *depth_unit,
             along: depth_along.unwrap_or_default(),
             points: depth_points.as_ref().map(|file| file.0.clone()),
+            drops_damaged: wanted == DepthChoice::Auto,
         };
         LoadOptions { depth, ..self.data.load_options(tracks) }
     }
@@ -215,6 +221,37 @@ mod tests {
     fn spec(option: &str, value: &str) -> Result<RunSpec, Failure> {
         let file: Table = format!("{option} = {value}").parse().unwrap();
         Partial::new(file, "file.toml")?.describe()
+    }
+
+    #[test]
+    fn a_named_cloud_must_be_used_unless_depth_is_off() {
+        let options = |lines: &str, is_known| {
+            let file: Table = lines.parse().unwrap();
+            let spec = Partial::new(file, "file.toml").unwrap().describe().unwrap();
+            spec.load_options(false, is_known).depth
+        };
+        let cloud = "depth_points = \"/cloud.ply\"";
+        for (depth, choice) in [
+            ("", DepthChoice::On),
+            ("depth = \"auto\"", DepthChoice::On),
+            ("depth = \"off\"", DepthChoice::Off),
+            ("depth_weight = 0", DepthChoice::Off),
+        ] {
+            let found = options(&format!("{cloud}\n{depth}"), None);
+            assert_eq!(found.choice, choice, "{depth}");
+            assert!(found.points.is_some(), "first points may come from it");
+        }
+        let found = options("", None);
+        assert!(found.choice == DepthChoice::Auto && found.drops_damaged);
+        let resumed = options("", Some(true));
+        assert!(resumed.choice == DepthChoice::On && resumed.drops_damaged);
+        assert!(!options("depth = \"on\"", None).drops_damaged);
+    }
+
+    #[test]
+    fn weights_have_the_range_of_f32() {
+        assert!(spec("distortion_weight", "1e38").is_ok());
+        assert!(spec("distortion_weight", "1e39").is_err());
     }
 
     #[test]

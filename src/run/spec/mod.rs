@@ -212,8 +212,8 @@ run_spec! {
         /// stereo/depth_maps, and depths/ with sparse/0/depth_params.json (default: auto)
         ///
         /// Depth is checked against the points that the views see: errors in scale of 2 to 20 % are corrected; larger
-        /// ones, distances along rays, inverse depth and shifted maps are refused. 0 and non-finite values are unknown,
-        /// not sky
+        /// ones, distances along rays, inverse depth, shifted maps and those of other views are refused. 0, negative and
+        /// non-finite values are unknown, not sky
         depth: Option<DepthChoice> = None, Fixed, value "WHEN";
 
         /// Length of one step of the values in the dataset's units, such as 0.001, 1/5000 (TUM) or 1/6553.5 (Replica);
@@ -225,7 +225,7 @@ run_spec! {
         depth_along: Option<DepthAlong> = None, Fixed, value "WHICH";
 
         /// Point cloud in the dataset's coordinates (PLY or LAS), such as a laser scan, to be projected into the views
-        /// instead of reading depth maps. If the dataset has no points, training starts from these
+        /// instead of reading depth maps, as with --depth on. If the dataset has no points, training starts from these
         depth_points: Option<AbsolutePath> = None, Fixed, value "FILE";
 
         /// Weight of the depth term, at the first and at the last iteration; one number: the same throughout (default:

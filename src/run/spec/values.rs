@@ -31,7 +31,7 @@ pub enum ImageCache {
 #[derive(Debug, Clone, Copy, PartialEq, PartialOrd, Serialize)]
 pub struct Fraction(pub f64);
 
-/// A finite number, at least 0.
+/// A number in the range of f32, at least 0.
 #[derive(Debug, Clone, Copy, PartialEq, PartialOrd, Serialize)]
 pub struct Weight(pub f64);
 
@@ -168,7 +168,9 @@ impl FromStr for Weight {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
-        let weight = text.parse().ok().filter(|weight: &f64| weight.is_finite() && *weight >= 0.0);
+        // Weights are used in f32.
+        let is_weight = |weight: &f64| (*weight as f32).is_finite() && *weight >= 0.0;
+        let weight = text.parse().ok().filter(is_weight);
         weight.map(Self).ok_or_else(|| format!("`{text}` must be a number from 0"))
     }
 }

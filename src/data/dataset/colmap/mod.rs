@@ -199,7 +199,7 @@ fn read(root: &Root, options: &LoadOptions) -> Result<Option<Scene>, LoadError> 
         let found = folders.image(named)?.ok_or_else(|| folders.missing(named))?;
         reduced_missing += usize::from(found.fell_back);
         let mask = folders.mask(&found, named, &photographs)?;
-        let depth = folders.depth(&found, named)?;
+        let depth = folders.depth(&found, named);
         frames.push(Frame {
             name: found.name,
             id: Some(image.id),
@@ -234,7 +234,7 @@ fn read(root: &Root, options: &LoadOptions) -> Result<Option<Scene>, LoadError> 
         notes.push(Note::Text(folders.fell_back_note(reduced_missing)));
     }
     let mut texts = Vec::new();
-    add_params(root, &chosen.folder, &mut frames, &mut texts)?;
+    add_params(root, &chosen.folder, &mut frames, &mut texts);
     notes.extend(text_notes(texts));
     let mut own_split = false;
     if options.split == Split::Eval {

@@ -14,7 +14,7 @@ use super::super::{LoadError, LoadOptions, Note, PointCloud, View};
 use super::check::check;
 use super::fit::fit_views;
 use super::points::{self, PointSet};
-use super::{DepthChoice, DepthSource, From, Meaning};
+use super::{DepthChoice, DepthSource, Faults, From, Meaning};
 use crate::error::{DepthRemedy, LoadRemedy};
 use densify_core::numbers::grouped;
 
@@ -67,7 +67,7 @@ impl DepthFinding {
             DepthOrigin::Surface => "the scene's surface",
         };
         let scale = match (self.points, self.is_corrected) {
-            (0, _) => "not compared with points, of which there are too few".to_owned(),
+            (0, _) => "not compared with points, as there are too few others".to_owned(),
             (points, false) => {
                 format!("{:.3} times that of {} points", self.scale, grouped(points))
             }
@@ -94,6 +94,8 @@ pub(in super::super) struct Scene<'a> {
     pub(in super::super) normalisation: &'a Normalisation,
     /// True if densify rendered the depth as ground truth.
     pub(in super::super) is_truth: bool,
+    /// True if the points are those of the [cloud](super::DepthOptions::points).
+    pub(in super::super) is_seeded: bool,
     /// The first fault met so far.
     pub(in super::super) fault: Option<LoadError>,
 }
@@ -114,7 +116,9 @@ pub(in super::super) fn decide(
     let used = match choice {
         DepthChoice::Off => Ok(None),
         DepthChoice::Auto if scene.is_truth && options.depth.points.is_none() => Ok(None),
-        DepthChoice::Auto | DepthChoice::On => prepare(&mut scene, options, notes),
+        DepthChoice::Auto | DepthChoice::On => {
+            prepare(&mut scene, options, notes).map_err(with_remedy)
+        }
     };
     let finding = match used {
         Ok(Some(finding)) => return Ok(Some(finding)),
@@ -134,6 +138,14 @@ pub(in super::super) fn decide(
         view.source.depth = None;
     }
     Ok(finding)
+}
+
+/// Adds to an error that the run needs no depth.
+fn with_remedy(error: LoadError) -> LoadError {
+    match error {
+        LoadError::Remedied { remedy: LoadRemedy::Depth(_), .. } => error,
+        other => refused(other.to_string(), DepthRemedy::LeaveOut),
+    }
 }
 
 pub(super) fn refused(problem: String, remedy: DepthRemedy) -> LoadError {
@@ -174,12 +186,16 @@ fn prepare(
     if is_relative {
         fit_views(scene, notes)?;
     }
-    let checked = check(scene, &options.depth.along, source)?;
+    let checked = check(scene, options.depth.along, source)?;
+    let faults = options.depth.drops_damaged.then(|| Arc::new(Faults::default()));
+    for depth in scene.train.iter_mut().filter_map(|view| view.source.depth.as_mut()) {
+        depth.faults.clone_from(&faults);
+    }
     let views = scene.train.iter().filter(|view| view.source.depth.is_some()).count();
     let verdict = checked.verdict;
     let scale = verdict.map_or(1.0, |verdict| verdict.scale);
     let error = (scale - 1.0).abs();
-    // A point cloud has the coordinates of the dataset, and its points may be those compared with.
+    // A point cloud has the coordinates of the dataset.
     let is_corrected = error > SCALE_IGNORED && source != DepthOrigin::Points;
     if is_corrected {
         for depth in scene.train.iter_mut().filter_map(|view| view.source.depth.as_mut()) {
@@ -195,6 +211,12 @@ fn prepare(
     let of_views = scene.train.len();
     if views < of_views {
         notes.push(Note::Text(format!("{} of {of_views} views have no depth", of_views - views)));
+    }
+    if checked.constant > 0 {
+        notes.push(Note::Text(format!(
+            "{} of {} checked depth maps have only one value each; such maps are not used",
+            checked.constant, checked.views
+        )));
     }
     if checked.empty > 0 {
         notes.push(Note::Text(format!(
@@ -216,13 +238,10 @@ fn prepare(
     }))
 }
 
-/// The points of a cloud that seed a scene without points.
+/// The points of a cloud that seed a scene without points, even if its depth is not used.
 pub(in super::super) fn first_points(
     options: &LoadOptions,
 ) -> Result<Option<PointCloud>, LoadError> {
-    if options.depth.choice == DepthChoice::Off {
-        return Ok(None);
-    }
     let cloud = options.depth.points.as_deref().map(points::read).transpose()?;
     Ok(cloud.filter(|cloud| cloud.positions.iter().any(|point: &DVec3| point.is_finite())))
 }

@@ -57,7 +57,7 @@ impl DepthKind {
 /// Names of folders of depth.
 const FOLDERS: [&str; 2] = ["depth", "depths"];
 /// Names of folders of photographs beside which there may be a folder of depth.
-const PHOTOGRAPHS: [&str; 4] = ["images", "rgb", "color", "image"];
+const PHOTOGRAPHS: [&str; 5] = ["images", "corrected_images", "rgb", "color", "image"];
 /// COLMAP's folder of depth maps, and the suffix of those that agree between views.
 const COLMAP: (&str, &str) = ("stereo/depth_maps", ".geometric.bin");
 const CONFIDENCE: &str = "confidence";

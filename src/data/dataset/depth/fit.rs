@@ -35,18 +35,7 @@ pub(super) fn fit_views(scene: &mut Scene<'_>, notes: &mut Vec<Note>) -> Result<
             .collect();
         fits.push(fit(&pairs));
     }
-    let scales = fits.iter().flatten().map(|fit| fit[0]);
-    let Some(middle) = median(scales.clone().collect()) else {
-        let problem = format!(
-            "relative depth needs {FIT_POINTS} points in each view to fit its scale and offset, but no view sees them"
-        );
-        return Err(refused(problem, DepthRemedy::Unit));
-    };
-    if scales.clone().filter(|scale| *scale <= 0.0).count() * 2 > scales.count() {
-        let problem =
-            "the values grow where the points are farther away: they are depth, not inverse depth";
-        return Err(refused(problem.to_owned(), DepthRemedy::NotRelative));
-    }
+    let middle = typical_scale(fits.iter().flatten().map(|fit| fit[0]))?;
     let mut dropped = 0;
     for (view, fit) in scene.train.iter_mut().zip(fits) {
         let Some(depth) = &mut view.source.depth else { continue };
@@ -66,6 +55,22 @@ pub(super) fn fit_views(scene: &mut Scene<'_>, notes: &mut Vec<Note>) -> Result<
         )));
     }
     Ok(())
+}
+
+/// The median of the positive scales.
+fn typical_scale(scales: impl Iterator<Item = f64>) -> Result<f64, LoadError> {
+    let (positive, others): (Vec<f64>, Vec<f64>) = scales.partition(|scale| *scale > 0.0);
+    if others.len() > positive.len() {
+        let problem =
+            "the values grow where the points are farther away: they are depth, not inverse depth";
+        return Err(refused(problem.to_owned(), DepthRemedy::NotRelative));
+    }
+    median(positive).ok_or_else(|| {
+        let problem = format!(
+            "relative depth needs {FIT_POINTS} points in each view to fit its scale and offset, but no view sees them"
+        );
+        refused(problem, DepthRemedy::MorePoints)
+    })
 }
 
 /// Scale and offset that map the first numbers to the second; the scale is negative if one falls where the other grows.
@@ -102,6 +107,19 @@ fn fit(pairs: &[[f64; 2]]) -> Option<[f64; 2]> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::error::LoadRemedy;
+
+    #[test]
+    fn scales_of_the_wrong_sign_do_not_move_the_typical_one() {
+        let typical = |scales: &[f64]| typical_scale(scales.iter().copied());
+        assert_eq!(typical(&[-3.0, 2.0, -1.0, 2.5, 2.2, -9.0]), Ok(2.2));
+        let remedy = |scales: &[f64]| match typical(scales) {
+            Err(LoadError::Remedied { remedy: LoadRemedy::Depth(remedy), .. }) => Some(remedy),
+            _ => None,
+        };
+        assert_eq!(remedy(&[-3.0, 2.0, -1.0]), Some(DepthRemedy::NotRelative));
+        assert_eq!(remedy(&[]), Some(DepthRemedy::MorePoints));
+    }
 
     #[test]
     fn relative_depth_is_fitted_with_the_sign_of_the_relation() {

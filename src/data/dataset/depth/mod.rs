@@ -9,6 +9,7 @@ mod check;
 mod colmap;
 mod decide;
 mod exr;
+mod faults;
 mod files;
 mod fit;
 mod npy;
@@ -32,12 +33,12 @@ pub use decide::{DepthFinding, DepthOrigin};
 pub(super) use decide::{Scene, decide, first_points};
 use densify_core::camera::Camera;
 use densify_core::image::depth::{DepthMap, SharedDepth};
+use faults::Faults;
 pub(super) use files::{DepthFile, DepthKind};
 pub use options::{DepthAlong, DepthChoice, DepthOptions, DepthUnit};
 pub(super) use params::add_params;
 pub(super) use points::PointSet;
 use raw::{DepthHeader, Values};
-use sample::Sampled;
 
 /// Largest relative difference of the width-to-height ratios of a depth map and its photograph: sensors of depth and of
 /// colour have sides of other ratios by up to this much, such as 640x480 and 1296x968.
@@ -53,6 +54,8 @@ pub struct DepthSource {
     to_scene: f64,
     /// The view's camera.
     camera: Camera,
+    /// Faults met in training, shared by all views; `None` if they are errors.
+    faults: Option<Arc<Faults>>,
 }
 
 /// The origin of the values.
@@ -119,7 +122,13 @@ impl DepthSource {
             && (confidence.width, confidence.height) != (header.width, header.height)
         {
             let sizes = (confidence.width, confidence.height);
-            return Err(another_size(&file.path, sizes, (header.width, header.height)));
+            let (width, height) = sizes;
+            let problem = format!(
+                "{width}x{height} px instead of the depth map's {}x{} px",
+                header.width, header.height
+            );
+            let remedy = "export them at the size of the depth map, or remove them";
+            return Err(LoadError::malformed(&file.path, "the confidences", problem, remedy));
         }
         let meaning = match (options.unit, inverse, unit) {
             (Some(DepthUnit::Relative), ..) => Meaning::Unfitted,
@@ -145,7 +154,7 @@ impl DepthSource {
 
     fn new(from: From, meaning: Meaning, along: DepthAlong) -> Self {
         let none = Camera::centred((1, 1), (1.0, 1.0), glam::DMat3::IDENTITY, glam::DVec3::ZERO);
-        Self { from, meaning, along, to_scene: 1.0, camera: none }
+        Self { from, meaning, along, to_scene: 1.0, camera: none, faults: None }
     }
 
     /// Sets the view's camera, and the scene units per world unit.
@@ -166,13 +175,17 @@ impl DepthSource {
         })
     }
 
-    /// Bytes of pixels and points in memory that this view's depth holds all the time `[bytes]`.
+    /// Bytes that this view's depth holds all the time, and each copy of it again `[bytes]`.
     pub fn held_bytes(&self) -> u64 {
+        let file = if matches!(self.from, From::File(_)) { size_of::<MapFile>() } else { 0 };
+        (size_of::<Self>() + file) as u64
+    }
+
+    /// Bytes of pixels in memory, which copies share `[bytes]`.
+    pub fn pixel_bytes(&self) -> u64 {
         match &self.from {
-            From::File(_) => size_of::<Self>() as u64 + size_of::<MapFile>() as u64,
-            // The points are shared by all views, and counted once.
-            From::Points(_) => size_of::<Self>() as u64,
-            From::Rendered(values) => (size_of::<Self>() + 4 * values.len()) as u64,
+            From::Rendered(values) => 4 * values.len() as u64,
+            From::File(_) | From::Points(_) => 0,
         }
     }
 
@@ -220,11 +233,26 @@ impl DepthSource {
     /// The depth map of a view; `None` if no depth is known.
     ///
     /// # Errors
-    /// When a file cannot be read, or is no longer what its header said.
+    /// When a file cannot be read, or is no longer what its header said, unless such [faults](Self::take_faults) are kept.
     pub(super) fn load(&self, view: &ImageSource) -> Result<Option<SharedDepth>, LoadError> {
-        let Sampled { inverse, confidence } = self.sampled(view)?;
+        let sampled = match (self.sampled(view), &self.faults) {
+            (Err(fault), Some(faults)) => {
+                faults.add(fault);
+                return Ok(None);
+            }
+            (sampled, _) => sampled?,
+        };
+        // As in the checks before training, which read only some of the views.
+        if self.path().is_some() && sampled.is_constant() {
+            return Ok(None);
+        }
         let size = (self.camera.width, self.camera.height);
-        Ok(DepthMap::quantised(size, &inverse, confidence).map(Arc::new))
+        Ok(DepthMap::quantised(size, &sampled.inverse, sampled.confidence).map(Arc::new))
+    }
+
+    /// The faults met since the last call, of this view and those that share the list.
+    pub(super) fn take_faults(&self) -> Vec<LoadError> {
+        self.faults.as_ref().map_or_else(Vec::new, |faults| faults.take())
     }
 
     /// The path for messages.

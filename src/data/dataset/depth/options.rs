@@ -17,6 +17,8 @@ pub struct DepthOptions {
     pub along: DepthAlong,
     /// A point cloud in the dataset's coordinates, which is projected into the views instead of reading depth maps.
     pub points: Option<PathBuf>,
+    /// True if a map that cannot be read in training costs only the depth of its view.
+    pub drops_damaged: bool,
 }
 
 /// The use of depth that is given beside photographs.

@@ -14,15 +14,30 @@ const NAME: &str = "depth_params.json";
 const RELIABLE: [f64; 2] = [0.2, 5.0];
 
 /// Reads the file beside a COLMAP model, if there is one, for frames whose depth is a PNG file. Maps without an entry,
-/// or with an unreliable one, are not used.
+/// or with an unreliable one, are not used. A fault of the file becomes one of these frames' depth.
 pub(in super::super) fn add_params(
     root: &Root,
     model: &Path,
     frames: &mut [Frame],
     notes: &mut Vec<String>,
+) {
+    if let Err(fault) = read_params(root, model, frames, notes) {
+        for frame in frames.iter_mut().filter(|frame| is_png(frame)) {
+            frame.depth = Err(fault.clone());
+        }
+    }
+}
+
+fn is_png(frame: &Frame) -> bool {
+    matches!(&frame.depth, Ok(Some(depth)) if depth.kind == DepthKind::Png)
+}
+
+fn read_params(
+    root: &Root,
+    model: &Path,
+    frames: &mut [Frame],
+    notes: &mut Vec<String>,
 ) -> Result<(), LoadError> {
-    let is_png =
-        |frame: &Frame| frame.depth.as_ref().is_some_and(|depth| depth.kind == DepthKind::Png);
     if !frames.iter().any(is_png) {
         return Ok(());
     }
@@ -56,11 +71,11 @@ pub(in super::super) fn add_params(
         let is_reliable =
             |scale: f64| (RELIABLE[0] * middle..=RELIABLE[1] * middle).contains(&scale);
         match (entry, &mut frame.depth) {
-            (Some(entry), Some(depth)) if is_reliable(entry[0]) => depth.inverse = Some(entry),
+            (Some(entry), Ok(Some(depth))) if is_reliable(entry[0]) => depth.inverse = Some(entry),
             (entry, depth) => {
                 missing += usize::from(entry.is_none());
                 unreliable += usize::from(entry.is_some());
-                *depth = None;
+                *depth = Ok(None);
             }
         }
     }

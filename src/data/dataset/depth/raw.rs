@@ -7,7 +7,7 @@ use std::path::Path;
 
 use image::imageops;
 use image::metadata::Orientation;
-use image::{ImageBuffer, Luma};
+use image::{DynamicImage, GrayImage, ImageBuffer, Luma};
 
 use super::super::LoadError;
 use super::super::images::SourceFile;
@@ -74,30 +74,27 @@ pub(in super::super) fn read_header(
     }
 }
 
-/// Reads a depth file. `keeps_zero` is true for inverse depth, of which 0 is a value.
+/// Reads a depth file; also returns the number of negative values, which are unknown. `keeps_zero` is true for inverse
+/// depth, of which 0 and negative numbers are values.
 pub(in super::super) fn read(
     source: &SourceFile,
     kind: DepthKind,
     keeps_zero: bool,
-) -> Result<Values, LoadError> {
+) -> Result<(Values, usize), LoadError> {
     let mut values = match kind {
         DepthKind::Png => png::read(source, keeps_zero)?,
         DepthKind::Npy => npy::read(source)?,
         DepthKind::Exr => without_panic(source, exr::read)?,
         DepthKind::Colmap => colmap::read(source)?,
     };
+    let mut negative = 0;
     for value in values.iter_mut() {
-        if *value < 0.0 && value.is_finite() && !keeps_zero {
-            let problem = format!(
-                "a depth is negative ({value}); depth is measured along the viewing direction, in front of the camera"
-            );
-            return Err(malformed(&source.path, "the values", problem));
-        }
-        if !value.is_finite() || (*value == 0.0 && !keeps_zero) {
+        negative += usize::from(*value < 0.0 && !keeps_zero);
+        if !value.is_finite() || (*value <= 0.0 && !keeps_zero) {
             *value = f32::NAN;
         }
     }
-    Ok(values)
+    Ok((values, negative))
 }
 
 /// Calls a decoder that may panic on damaged files, and turns a panic into an error.
@@ -113,9 +110,16 @@ fn without_panic<T>(
 pub(in super::super) fn read_confidence(
     source: &SourceFile,
 ) -> Result<ImageBuffer<Luma<u8>, Vec<u8>>, LoadError> {
-    let mut levels = super::super::images::decode(source)?.into_luma8();
     // ARKit has the levels 0, 1 and 2.
-    if levels.iter().all(|&level| level <= 2) {
+    const MOST: u16 = 2;
+    let mut levels = match super::super::images::decode(source)? {
+        // Conversion to eight bits would turn these into 0.
+        DynamicImage::ImageLuma16(deep) if deep.iter().all(|&level| level <= MOST) => {
+            GrayImage::from_fn(deep.width(), deep.height(), |x, y| [deep[(x, y)].0[0] as u8].into())
+        }
+        levels => levels.into_luma8(),
+    };
+    if levels.iter().all(|&level| u16::from(level) <= MOST) {
         levels.iter_mut().for_each(|level| *level = (*level * 127).saturating_add(*level / 2));
     }
     Ok(levels)

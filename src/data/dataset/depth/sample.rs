@@ -27,6 +27,18 @@ pub(super) struct Sampled {
     pub(super) inverse: Vec<f32>,
     /// Weight of each pixel, 0 to 255.
     pub(super) confidence: Vec<u8>,
+    /// Share of negative values among those of the file that are not 0 and finite, in `[0, 1]`.
+    pub(super) negative: f64,
+}
+
+impl Sampled {
+    /// Returns true if more than one depth is known, and all are the same.
+    pub(super) fn is_constant(&self) -> bool {
+        let mut known = self.inverse.iter().filter(|x| **x > 0.0 && x.is_finite());
+        let Some(first) = known.next() else { return false };
+        let mut others = known.peekable();
+        others.peek().is_some() && others.all(|x| (x - first).abs() <= 1e-6 * first)
+    }
 }
 
 impl DepthSource {
@@ -35,10 +47,12 @@ impl DepthSource {
         if let From::Points(points) = &self.from {
             let inverse = points.projected(&self.camera);
             let confidence = vec![255; inverse.len()];
-            return Ok(Sampled { inverse, confidence });
+            return Ok(Sampled { inverse, confidence, negative: 0.0 });
         }
-        let (values, confidence) = self.values()?;
+        let (values, negative, confidence) = self.values()?;
         let values = values.as_ref();
+        let known = values.iter().filter(|value| !value.is_nan()).count();
+        let negative = negative as f64 / (negative + known).max(1) as f64;
         let file = DVec2::new(f64::from(values.width()), f64::from(values.height()));
         let (width, height) = view.whole_size();
         let whole = DVec2::new(f64::from(width), f64::from(height));
@@ -52,8 +66,11 @@ impl DepthSource {
         let reach = [half.x, half.y].map(|half| (2.0 * half).round().max(1.0) as i64);
         let limit = EDGE.max(NOISE * self.noise(values, reach));
         let pixels = self.camera.width as usize * self.camera.height as usize;
-        let mut sampled =
-            Sampled { inverse: Vec::with_capacity(pixels), confidence: Vec::with_capacity(pixels) };
+        let mut sampled = Sampled {
+            inverse: Vec::with_capacity(pixels),
+            confidence: Vec::with_capacity(pixels),
+            negative,
+        };
         for y in 0..self.camera.height {
             for x in 0..self.camera.width {
                 let pixel = DVec2::new(f64::from(x) + 0.5, f64::from(y) + 0.5);
@@ -84,15 +101,15 @@ impl DepthSource {
         Ok(sampled)
     }
 
-    /// The values of the file, turned like the photograph, and their confidences.
-    fn values(&self) -> Result<(std::borrow::Cow<'_, Values>, Option<Vec<u8>>), LoadError> {
+    /// The values of the file, turned like the photograph, the number of negative ones, and their confidences.
+    fn values(&self) -> Result<(std::borrow::Cow<'_, Values>, usize, Option<Vec<u8>>), LoadError> {
         use std::borrow::Cow;
         let MapFile { file, kind, header, confidence, turn } = match &self.from {
             From::File(map) => &**map,
-            From::Rendered(values) => return Ok((Cow::Borrowed(values), None)),
-            From::Points(_) => return Ok((Cow::Owned(Values::default()), None)),
+            From::Rendered(values) => return Ok((Cow::Borrowed(values), 0, None)),
+            From::Points(_) => return Ok((Cow::Owned(Values::default()), 0, None)),
         };
-        let mut values = raw::read(file, *kind, self.meaning.keeps_zero())?;
+        let (mut values, negative) = raw::read(file, *kind, self.meaning.keeps_zero())?;
         let changed = |path, (width, height): (u32, u32)| {
             let problem = format!("it has become {width}x{height} px since the run began");
             Err(LoadError::malformed(path, "the depth map", problem, "restore it"))
@@ -103,7 +120,7 @@ impl DepthSource {
         if let Some(turn) = turn {
             values = raw::turned(values, *turn);
         }
-        let Some((file, _)) = confidence else { return Ok((Cow::Owned(values), None)) };
+        let Some((file, _)) = confidence else { return Ok((Cow::Owned(values), negative, None)) };
         let mut levels = raw::read_confidence(file)?;
         if levels.dimensions() != (header.width, header.height) {
             return changed(&file.path, levels.dimensions());
@@ -111,7 +128,7 @@ impl DepthSource {
         if let Some(turn) = turn {
             levels = raw::turned(levels, *turn);
         }
-        Ok((Cow::Owned(values), Some(levels.into_raw())))
+        Ok((Cow::Owned(values), negative, Some(levels.into_raw())))
     }
 
     /// Inverse of the distance that a value stands for `[1/scene units]`.

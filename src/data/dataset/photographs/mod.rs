@@ -162,12 +162,13 @@ fn photograph(
         Ok::<_, LoadError>(Mask { file, hides, mode: options.mask_mode })
     });
     let mask = mask.transpose()?;
-    let depth =
-        frame.depth.as_ref().map(|found| DepthSource::of_file(found, header, &options.depth));
+    let depth = frame.depth.as_ref().map_err(LoadError::clone).and_then(|found| {
+        let found = found.as_ref();
+        found.map(|found| DepthSource::of_file(found, header, &options.depth)).transpose()
+    });
     let (depth, depth_fault) = match depth {
-        None => (None, None),
-        Some(Ok(depth)) => (Some(Box::new(depth)), None),
-        Some(Err(fault)) => (None, Some(fault)),
+        Ok(depth) => (depth.map(Box::new), None),
+        Err(fault) => (None, Some(fault)),
     };
     let view = |face: &str, undistortion: Option<Undistortion>| {
         let whole = Pinhole {

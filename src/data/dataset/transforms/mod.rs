@@ -142,7 +142,7 @@ fn read(
             Some(value) => Some(fields.mask((root, folders, &photographs), &found, value)?),
             None => folders.mask(&found, named, &photographs)?,
         };
-        let depth = fields.depth((root, folders), &found, named)?;
+        let depth = fields.depth((root, folders), &found, named);
         let (lens, header) = fields.lens(&found.path, found.reduced)?;
         let frame = Frame {
             name: found.name,

@@ -77,15 +77,20 @@ pub(in super::super) fn usual_points(
 }
 
 impl Fields<'_> {
-    /// The depth file that a frame names, or else one with the name of the image, if depth is read. A missing file is not an error, as depth may be left out.
+    /// The depth file that a frame names, or that lies in a usual place, if depth is read. A missing file is not an error,
+    /// as depth may be left out.
     pub(super) fn depth(
         &self,
         (root, folders): (&Root, &Folders),
         image: &ImageFile,
-        listed: DataPath<'_>,
+        photograph: DataPath<'_>,
     ) -> Result<Option<DepthFile>, LoadError> {
-        let value = self.text("depth_file_path")?.filter(|_| folders.reads_depth);
-        let Some(value) = value else { return folders.depth(image, listed) };
+        if !folders.reads_depth {
+            return Ok(None);
+        }
+        let Some(value) = self.text("depth_file_path")? else {
+            return folders.depth(image, photograph);
+        };
         let field = self.full("depth_file_path");
         let named = DataPath { file: self.path, field: &field, value };
         let found = if folders.folder_for_absolute(value).is_some() {
