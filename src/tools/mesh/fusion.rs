@@ -170,7 +170,7 @@ impl<'a> View<'a> {
             return;
         }
         let origin = self.place(first).as_vec3();
-        let [along_x, along_y, along_z] = self.steps.map(|step| step.as_vec3());
+        let [along_x, along_y, along_z] = self.steps.map(DVec3::as_vec3);
         for (row, voxels) in voxels.chunks_exact_mut(SIDE).enumerate() {
             let (y, z) = ((row % SIDE) as f32, (row / SIDE) as f32);
             let start = origin + along_y * y + along_z * z;

@@ -240,7 +240,7 @@ impl Truth {
             Options { size: Some((size, size)), train: Some(views), ..Options::default() };
         let scene = Scene::prepare(&Source::Preset("room".to_owned()), &options).unwrap();
         let views = scene.views.iter().take(views as usize);
-        let cameras = views.map(|view| view.camera.clone()).collect();
+        let cameras = views.map(|view| view.camera).collect();
         Self { truth: GroundTruth::of_scene(scene), cameras }
     }
 
@@ -296,6 +296,5 @@ fn true_depth_gives_the_true_surface() {
         FuseOptions { voxel: None, region: None, min_component: 0.001, memory: 1 << 30, unit: 1.0 };
     let fused = fuse(&mut room, &options, &Silent).unwrap();
     let errors = room.errors(&fused.mesh);
-    println!("{} blocks, {} triangles: {errors:?}", fused.blocks, fused.mesh.triangles.len());
     assert!(errors.f_score_one_percent >= 0.95, "{errors:?}");
 }
