@@ -144,6 +144,18 @@ fn a_region_cuts_the_surface() {
     let cut = fused(&FuseOptions { region: Some(upper), ..SPHERE }).unwrap().mesh;
     let lowest = (0..cut.positions.len()).map(|i| cut.place_of(i).y).fold(9.0, f64::min);
     assert!((0.3..0.36).contains(&lowest), "{lowest}");
+    // The upper sides are kept as well, wherever they are within a block.
+    for y in [-0.62, 0.11, 0.3] {
+        let high = DVec3::new(2.0, y, 0.5);
+        let region = Region { low: DVec3::splat(-2.0), high };
+        let cut = fused(&FuseOptions { region: Some(region), ..SPHERE }).unwrap().mesh;
+        let places = (0..cut.positions.len()).map(|i| cut.place_of(i));
+        let highest = places.reduce(DVec3::max).unwrap();
+        for axis in [1, 2] {
+            let beyond = highest[axis] - high[axis];
+            assert!((-0.1..1e-6).contains(&beyond), "{highest}, {high}");
+        }
+    }
 }
 
 #[test]
