@@ -116,7 +116,7 @@ fn a_sphere_becomes_a_closed_surface_of_its_colours() {
 fn passes_and_threads_change_nothing() {
     let whole = fused(&SPHERE).unwrap();
     assert!(whole.blocks > 200, "{}", whole.blocks);
-    let small = fused(&FuseOptions { memory: 1 << 20, ..SPHERE }).unwrap();
+    let small = fused(&FuseOptions { memory: 5 << 18, ..SPHERE }).unwrap();
     assert!(small.passes > 2, "{}", small.passes);
     assert!(small.mesh == whole.mesh);
     for threads in [1, 3] {
