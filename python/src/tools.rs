@@ -91,12 +91,12 @@ pub(crate) fn compress(
                     model.display()
                 ))
             })?;
-        let (data, near, exposure) = match of_run {
-            None => (given.data, given.start.near, None),
+        let (data, depth, near, exposure) = match of_run {
+            None => (given.data, given.depth, given.start.near, None),
             Some(config) => {
                 let model = config.spec.schedule.exposure_model;
                 let exposure = config.resolved.has_exposures.then_some(model);
-                (config.spec.data, config.spec.start.near, exposure)
+                (config.spec.data, config.spec.depth, config.spec.start.near, exposure)
             }
         };
         let done = compressing::compress(
@@ -104,6 +104,7 @@ pub(crate) fn compress(
                 model: &file,
                 scene: &scene,
                 data,
+                depth,
                 exposure,
                 near,
                 antialias,

@@ -7,7 +7,7 @@ use clap::{ArgMatches, Args};
 
 use super::console::Console;
 use super::export::{check_output, format_from_extension};
-use super::mesh::{BoxArgument, not_negative};
+use super::mesh::{BoxArgument, share};
 use super::render::{RenderingArgs, refuse_scene_options};
 use super::threads;
 use super::train::Follower;
@@ -16,14 +16,14 @@ use densify_core::numbers::{counted, gaussians, grouped, percent};
 use densify_data::models::{Coordinates, find};
 use densify_run::failure::Failure;
 use densify_run::finished::{is_model, model_file, write_model};
-use densify_run::{Fraction, RunConfig, Whole};
+use densify_run::{DepthSpec, Fraction, RunConfig, Whole};
 use densify_train::evaluate::Split;
 
 /// Removes floaters from a trained model, and writes the rest to another file.
 ///
 /// Removes Gaussians with over half of their weight (α·T, over all pixels of the training views) in front of the
-/// surface, which is the median depth of each pixel as the model itself shows it; Gaussians that no training view shows;
-/// small groups far from all others; and, with --box, what is outside. Prints how many Gaussians each rule removed, and
+/// surface, which is the median depth of each pixel as the model itself shows it (depth maps of the dataset are not
+/// used); Gaussians that no training view shows; small groups far from all others; and, with --box, what is outside. Prints how many Gaussians each rule removed, and
 /// the change in PSNR of the test views (of the training views, if no views are held out). Floaters often hide errors of
 /// the surface behind them, so PSNR falls at first; --refine trains the rest further, without new Gaussians.
 #[derive(Debug, Args)]
@@ -67,7 +67,7 @@ pub(super) struct CleanArgs {
     keep_unseen: bool,
     /// Remove separate groups of Gaussians with less than this share of all weight; 0: none. Groups are separate if
     /// there is a gap of 1/32 of the radius that holds four fifths of all Gaussians, or more farther out
-    #[arg(long, value_name = "SHARE", default_value_t = 0.001, value_parser = not_negative)]
+    #[arg(long, value_name = "SHARE", default_value_t = 0.001, value_parser = share)]
     isolated: f64,
     /// Remove what is outside of this box, in the dataset's coordinates
     #[arg(long = "box", value_name = "X0,Y0,Z0,X1,Y1,Z1", allow_hyphen_values = true)]
@@ -104,21 +104,21 @@ pub(super) fn run(
         )));
     }
     let RenderingArgs { near, antialias, device, data } = &args.rendering;
-    let (scene, mut data, near, exposure) = if is_model(&args.model) {
+    let (scene, mut data, depth, near, exposure) = if is_model(&args.model) {
         let Some(scene) = args.scene.clone() else {
             return Err(Failure::input(format!(
                 "{} is a file, which has no photographs; name its dataset with --scene DIR",
                 args.model.display()
             )));
         };
-        (scene, data.clone(), *near, None)
+        (scene, data.clone(), DepthSpec::default(), *near, None)
     } else {
         refuse_scene_options(matches)?;
         let config = RunConfig::read(&args.model)?;
         let scene = args.scene.clone().unwrap_or_else(|| config.scene_path());
         let model = config.spec.schedule.exposure_model;
         let exposure = config.resolved.has_exposures.then_some(model);
-        (scene, config.spec.data, config.spec.start.near, exposure)
+        (scene, config.spec.data, config.spec.depth, config.spec.start.near, exposure)
     };
     // For a file, test views are held out as in `densify eval`.
     data.eval |= is_model(&args.model) && data.test_every.is_none();
@@ -126,6 +126,7 @@ pub(super) fn run(
         model: &model,
         scene: &scene,
         data,
+        depth,
         exposure,
         near,
         antialias: *antialias,

@@ -83,7 +83,8 @@ pub(super) fn run(args: &EvalArgs, matches: &ArgMatches, console: &Console) -> R
     let model = &args.model;
     let limits = Limits { lowest: &args.fail_below, highest: &args.fail_above };
     if is_mesh(model) {
-        return mesh::evaluate(model, args.scene.as_deref(), (&args.rendering, limits), console);
+        let scene = args.scene.as_deref();
+        return mesh::evaluate((model, scene), (&args.rendering, limits), matches, console);
     }
     // A folder without config.toml is not a run, and is refused whatever other files it holds.
     let run = if is_model(model) {

@@ -1,6 +1,6 @@
 //! `densify mesh`: a triangle mesh of the surface that a model shows.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
 use clap::{ArgMatches, Args};
@@ -8,15 +8,17 @@ use glam::DVec3;
 
 use super::console::Console;
 use super::export::check_output;
-use super::render::{ModelArgument, RenderingArgs};
+use super::render::{ModelArgument, RenderingArgs, given_option};
 use densify_core::memory::Bytes;
 use densify_core::numbers::{counted, grouped, percent};
 use densify_inspect::{Limits, mesh_values};
 use densify_mesh::{
-    DepthKind, FuseOptions, Fused, MeshErrors, MeshFormat, ModelSource, Region, fuse, score,
+    DepthKind, DepthSource, FuseOptions, Fused, MeshError, MeshErrors, MeshFormat, ModelSource,
+    Region, fuse, score,
 };
 use densify_policies::policy::Needs;
 use densify_render::BackendChoice;
+use densify_run::coordinate_check::CoordinateCheck;
 use densify_run::failure::Failure;
 use densify_run::{ByteCount, DeviceSpec, ProcessMemory};
 use densify_train::evaluate::Split;
@@ -58,7 +60,7 @@ pub(super) struct MeshArgs {
     #[arg(long, value_name = "DIR")]
     scene: Option<PathBuf>,
     /// Length of a voxel in the dataset's unit; details of half this size are lost `[default: 1/256 of the diagonal of
-    /// the box around the scene, which is printed]`
+    /// --box or of the box around the scene, which is printed]`
     #[arg(long, value_name = "LENGTH", value_parser = positive)]
     voxel: Option<f64>,
     /// Limit of the memory of this command: 512MiB, 2GiB `[default: half of what the system has available]`
@@ -72,7 +74,7 @@ pub(super) struct MeshArgs {
     #[arg(long, value_name = "FRACTION", default_value_t = 0.4, value_parser = not_negative)]
     max_spread: f64,
     /// Drop connected parts with less than this fraction of the mesh's area
-    #[arg(long, value_name = "FRACTION", default_value_t = 0.001, value_parser = not_negative)]
+    #[arg(long, value_name = "FRACTION", default_value_t = 0.001, value_parser = share)]
     min_component: f64,
     /// Fuse only this part of space, in the dataset's coordinates `[default: around the points that the views show]`
     #[arg(long = "box", value_name = "X0,Y0,Z0,X1,Y1,Z1", allow_hyphen_values = true)]
@@ -120,9 +122,15 @@ fn positive(text: &str) -> Result<f64, String> {
 }
 
 /// Parses a number >= 0.
-pub(super) fn not_negative(text: &str) -> Result<f64, String> {
+fn not_negative(text: &str) -> Result<f64, String> {
     let number = text.parse().ok().filter(|number: &f64| number.is_finite() && *number >= 0.0);
     number.ok_or_else(|| "give a number from 0 on".to_owned())
+}
+
+/// Parses a share, from 0 to 1.
+pub(super) fn share(text: &str) -> Result<f64, String> {
+    let number = text.parse().ok().filter(|number| (0.0..=1.0).contains(number));
+    number.ok_or_else(|| "give a number from 0 to 1".to_owned())
 }
 
 pub(super) fn run(args: &MeshArgs, matches: &ArgMatches, console: &Console) -> Result<(), Failure> {
@@ -141,19 +149,13 @@ pub(super) fn run(args: &MeshArgs, matches: &ArgMatches, console: &Console) -> R
     let mut opened = argument.open(&rendering, Needs::default(), matches, console)?;
     let views = opened.views(Split::Train)?;
     let normalisation = opened.dataset.normalisation;
-    let (width, height) = opened.dataset.largest_image();
-    let memory = memory_left(args.memory, u64::from(width) * u64::from(height))?;
     let region = args.region.map(|BoxArgument { low, high }| Region {
         low: normalisation.scene_from_world(low),
         high: normalisation.scene_from_world(high),
     });
-    let options = FuseOptions {
-        voxel: args.voxel.map(|voxel| voxel * normalisation.scale),
-        region,
-        min_component: args.min_component,
-        memory,
-        unit: normalisation.scale,
-    };
+    let background = opened.data.background.fixed();
+    CoordinateCheck::measure(opened.backend.as_mut(), &views, (background, opened.sh_degree))?
+        .require(None, &args.model, console)?;
     let mut source = ModelSource {
         backend: opened.backend.as_mut(),
         views: &views,
@@ -161,9 +163,19 @@ pub(super) fn run(args: &MeshArgs, matches: &ArgMatches, console: &Console) -> R
         depth: args.depth_kind,
         max_spread: args.max_spread as f32,
     };
+    // Memory is measured after a view was rendered, since the renderer's lists take some only then.
+    source.frame(0)?;
+    let (width, height) = opened.dataset.largest_image();
+    let memory = memory_left(args.memory, u64::from(width) * u64::from(height))?;
+    let options = FuseOptions {
+        voxel: args.voxel.map(|voxel| voxel * normalisation.scale),
+        region,
+        min_component: args.min_component,
+        memory,
+        unit: normalisation.scale,
+    };
     let fused = fuse(&mut source, &options, console);
-    let Fused { mesh, passes, dropped: (count, share), .. } =
-        fused.map_err(|error| Failure::input(format!("{error}{}", error.remedy())))?;
+    let Fused { mesh, passes, dropped: (count, share), .. } = fused.map_err(failure_of)?;
     if passes > 1 {
         console.say(format_args!("fused    in {passes} passes, within the memory"));
     }
@@ -180,6 +192,14 @@ pub(super) fn run(args: &MeshArgs, matches: &ArgMatches, console: &Console) -> R
         args.output.display()
     ));
     Ok(())
+}
+
+/// The failure, with its remedy. A view that cannot be rendered keeps its exit code.
+fn failure_of(error: MeshError) -> Failure {
+    match error {
+        MeshError::Source(failure) => failure,
+        error => Failure::input(format!("{error}{}", error.remedy())),
+    }
 }
 
 /// The same options for the processor, on which depth is measured.
@@ -208,13 +228,23 @@ fn memory_left(given: Option<ByteCount>, pixels: u64) -> Result<u64, Failure> {
     })
 }
 
+/// Options of `densify eval` that apply only to models.
+const MODEL_OPTIONS: [&str; 8] =
+    ["iteration", "split", "lpips", "fit_exposure", "near", "antialias", "backend", "gpu"];
+
 /// Measures a mesh against the known surface of a scene, for `densify eval`.
 pub(super) fn evaluate(
-    file: &std::path::Path,
-    scene: Option<&std::path::Path>,
+    (file, scene): (&Path, Option<&Path>),
     (rendering, limits): (&RenderingArgs, Limits<'_>),
+    matches: &ArgMatches,
     console: &Console,
 ) -> Result<(), Failure> {
+    if let Some(option) = given_option(MODEL_OPTIONS, matches) {
+        let file = file.display();
+        return Err(Failure::input(format!(
+            "{option} is for models, and {file} is a mesh; leave the option out"
+        )));
+    }
     let Some(scene) = scene else {
         let file = file.display();
         return Err(Failure::input(format!(
@@ -250,6 +280,13 @@ fn format_table(errors: &MeshErrors) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn failures_keep_their_exit_codes() {
+        let device = failure_of(MeshError::Source(Failure::new(3, "the device fails")));
+        assert_eq!((device.code, device.to_string().as_str()), (3, "the device fails"));
+        assert_eq!(failure_of(MeshError::Empty).code, 2);
+    }
 
     #[test]
     fn boxes_are_six_numbers_in_order() {

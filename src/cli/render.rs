@@ -141,17 +141,22 @@ pub(super) fn run(
 pub(super) fn refuse_scene_options(matches: &ArgMatches) -> Result<(), Failure> {
     let scene = DataSpec::augment_args(clap::Command::new("scene"));
     let names = scene.get_arguments().map(|argument| argument.get_id().as_str()).chain(["near"]);
-    match names
-        .into_iter()
-        .find(|name| matches.value_source(name) == Some(ValueSource::CommandLine))
-    {
+    match given_option(names, matches) {
         None => Ok(()),
-        Some(name) => Err(Failure::input(format!(
-            "--{} is for a file with --scene DIR (a run brings its own); add --scene DIR to a file, or leave the \
-             option out",
-            name.replace('_', "-")
+        Some(option) => Err(Failure::input(format!(
+            "{option} is for a file with --scene DIR (a run brings its own); add --scene DIR to a file, or leave the \
+             option out"
         ))),
     }
+}
+
+/// The first of the options with these names that was given on the command line.
+pub(super) fn given_option<'a>(
+    names: impl IntoIterator<Item = &'a str>,
+    matches: &ArgMatches,
+) -> Option<String> {
+    let is_given = |name: &&str| matches.value_source(name) == Some(ValueSource::CommandLine);
+    names.into_iter().find(is_given).map(|name| format!("--{}", name.replace('_', "-")))
 }
 
 /// The model that a command line names: a run, or a file with its dataset.

@@ -24,7 +24,7 @@ pub mod spec;
 pub use companion::{Companion, CompanionSize};
 pub use host::Host;
 pub use near_plane::NearPlane;
-pub use observer::{Interrupt, NextAction, Observer, Silent, say_notes};
+pub use observer::{Interrupt, NextAction, Observer, Silent, check_interrupt, say_notes};
 pub use process::{MemoryLimit, ProcessMemory, grant};
 pub use resolved::{
     Alternatives, DEFAULT_BUDGET, DegreeSource, ExposureSource, Findings, ModelSize, Plan,

@@ -9,7 +9,7 @@ use densify_train::evaluate::Mean;
 use densify_train::output::StepRecord;
 use densify_train::trainer::{EditEvent, RowHistory};
 
-use crate::failure::notes;
+use crate::failure::{Failure, TrainingProblem, notes};
 
 /// A signal that asks a run to end in an orderly way.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -80,6 +80,16 @@ pub trait Observer {
     fn interrupt(&self) -> Option<Interrupt> {
         None
     }
+}
+
+/// Fails if a signal asks to stop. For loops that have written nothing yet.
+///
+/// # Errors
+/// When the observer reports a signal; the exit code is that of the signal.
+pub fn check_interrupt(observer: &dyn Observer) -> Result<(), Failure> {
+    let Some(Interrupt { name, exit_code }) = observer.interrupt() else { return Ok(()) };
+    let stopped = TrainingProblem::Stopped { by: name, step: None };
+    Err(Failure::with_code(exit_code, stopped))
 }
 
 /// Ignores everything.

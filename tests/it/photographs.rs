@@ -73,7 +73,7 @@ fn points() -> Vec<([f64; 3], [u8; 3])> {
 }
 
 /// A camera of the ring that looks at the origin.
-fn camera(view: usize) -> Camera {
+pub(crate) fn camera(view: usize) -> Camera {
     let angle = TAU * view as f64 / VIEWS as f64;
     let height = [0.9, -0.4, 0.2][view % 3];
     let centre = DVec3::new(4.0 * angle.sin(), height, 4.0 * angle.cos());

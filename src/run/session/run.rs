@@ -5,9 +5,9 @@ use std::path::PathBuf;
 use super::records::SavedSession;
 use super::resume::Resumed;
 use super::{Occupied, prepare, train};
-use crate::failure::{Failure, TrainingProblem};
+use crate::failure::Failure;
 use crate::host::Host;
-use crate::observer::{Interrupt, Observer};
+use crate::observer::{Observer, check_interrupt};
 use crate::process::ProcessMemory;
 use crate::resolved::{GeometryMeasurement, RunConfig};
 use crate::spec::RunSpec;
@@ -73,10 +73,7 @@ impl Run {
     /// When a view cannot be read, the device fails, or the observer asks to stop.
     pub fn model_after_training(mut self, observer: &dyn Observer) -> Result<Gaussians, Failure> {
         while self.trainer.steps_done() < self.last {
-            if let Some(Interrupt { name, exit_code }) = observer.interrupt() {
-                let stopped = TrainingProblem::Stopped { by: name, step: None };
-                return Err(Failure::with_code(exit_code, stopped));
-            }
+            check_interrupt(observer)?;
             self.trainer.step()?;
         }
         let to_world = self.dataset.normalisation;

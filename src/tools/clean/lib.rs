@@ -1,7 +1,7 @@
 //! Removes floaters from a trained model: Gaussians in front of the surface, Gaussians that no view shows, and small
 //! groups far from all others (`rules.rs`, `isolated.rs`). The rest can be trained further (`refine.rs`).
 //!
-//! The training views decide. Their surface is the model's own median depth, since the true surface is unknown.
+//! The training views decide. Their surface is the model's own median depth; depth maps of the dataset are not used.
 
 mod isolated;
 mod refine;
@@ -14,9 +14,10 @@ use densify_core::antialiasing::Antialiasing;
 use densify_core::gaussians::Gaussians;
 use densify_data::dataset::Dataset;
 use densify_data::views::ViewSource;
+use densify_run::coordinate_check::CoordinateCheck;
 use densify_run::failure::Failure;
 use densify_run::finished::{Machine, load, near_plane, read_model_as, views_of};
-use densify_run::{DataSpec, DeviceSpec, Fraction, Observer};
+use densify_run::{DataSpec, DepthSpec, DeviceSpec, Fraction, Observer, check_interrupt};
 use densify_train::evaluate::Split;
 use densify_train::exposure::{ExposureModel, fitted};
 use densify_train::metrics::psnr;
@@ -32,6 +33,8 @@ pub struct Options<'a> {
     pub scene: &'a Path,
     /// Options with which the dataset is read.
     pub data: DataSpec,
+    /// Depth options of the training.
+    pub depth: DepthSpec,
     /// Exposure model, if the model was trained with an exposure per photograph.
     pub exposure: Option<ExposureModel>,
     /// Near plane, as a fraction of the scene's extent; `None`: the usual near plane of the dataset.
@@ -68,7 +71,8 @@ pub struct Cleaned {
 /// Cleans a model.
 ///
 /// # Errors
-/// When a file cannot be read, nothing would be left, the device fails, or the observer interrupts.
+/// When a file cannot be read, the model is not in the coordinates of the dataset, nothing would be left, the device
+/// fails, or the observer interrupts.
 pub fn clean(options: &Options<'_>, observer: &dyn Observer) -> Result<Cleaned, Failure> {
     let machine = Machine::open(&options.device, observer)?;
     let dataset = load(options.scene, &options.data, observer)?;
@@ -79,11 +83,13 @@ pub fn clean(options: &Options<'_>, observer: &dyn Observer) -> Result<Cleaned, 
         return Err(Failure::input(format!("{file} has no Gaussian; name another model")));
     }
     let split = if dataset.test.is_empty() { Split::Train } else { Split::Test };
-    let judge = Judge { dataset: &dataset, machine: &machine, near, split, options };
-    let mut stages = vec![(model.len(), judge.psnr(&model)?)];
+    let judge = Judge { dataset: &dataset, machine: &machine, near, split, options, observer };
+    let (before, check) = judge.measure(&model)?;
+    check.require(None, options.model, observer)?;
+    let mut stages = vec![(model.len(), before)];
     let mut rounds = Vec::new();
     for _ in 0..options.rounds {
-        let weights = weights::measure(&model, (&dataset, near), options)?;
+        let weights = weights::measure(&model, (&dataset, near), options, observer)?;
         let (kept, removed) = rules::apply(&model, &weights, &options.rules);
         if kept.is_empty() {
             return Err(Failure::input(
@@ -113,16 +119,25 @@ struct Judge<'a> {
     near: f32,
     split: Split,
     options: &'a Options<'a>,
+    observer: &'a dyn Observer,
 }
 
 impl Judge<'_> {
-    /// Mean PSNR `[dB]`, with the best-fitting exposure of each photograph if exposures are learned.
+    /// Mean PSNR `[dB]`.
     fn psnr(&self, model: &Gaussians) -> Result<f64, Failure> {
+        Ok(self.measure(model)?.0)
+    }
+
+    /// Mean PSNR `[dB]`, with the best-fitting exposure of each photograph if exposures are learned, and the comparison
+    /// of coordinates.
+    fn measure(&self, model: &Gaussians) -> Result<(f64, CoordinateCheck), Failure> {
         let background = self.options.data.background.fixed();
         let mut backend = self.machine.backend(self.dataset, model.clone(), self.near)?;
         let views = views_of(self.dataset, self.split)?;
+        let mut check = CoordinateCheck::new(views.count());
         let mut sum = 0.0;
         for view in 0..views.count() {
+            check_interrupt(self.observer)?;
             views.prefetch_after(view);
             let image = views.image(view).map_err(Failure::input)?;
             let rendering = backend.render(views.camera(view), background, model.sh_degree)?;
@@ -133,7 +148,8 @@ impl Judge<'_> {
                 value = score(&fitted(&rendering.rgb, &image, background))?;
             }
             sum += value;
+            check.add(view, &rendering, &image, background);
         }
-        Ok(sum / views.count() as f64)
+        Ok((sum / views.count() as f64, check))
     }
 }

@@ -47,7 +47,8 @@ fn describe_run(
     options: &Options<'_>,
     scratch: &Path,
 ) -> Result<RunSpec, Failure> {
-    let mut spec = RunSpec { data: options.data.clone(), ..RunSpec::default() };
+    let mut spec =
+        RunSpec { data: options.data.clone(), depth: options.depth.clone(), ..RunSpec::default() };
     spec.device = options.device.clone();
     spec.start.scene = Some(options.scene.to_owned());
     let file = std::path::absolute(scratch).map_err(Failure::input)?;

@@ -22,7 +22,7 @@ use densify_core::numbers::{gaussians, grouped};
 use densify_data::models::{Coarseness, Format, Frame, PLY, local_origin, offset_text};
 use densify_run::failure::Failure;
 use densify_run::finished::{read_model, read_model_as, say_unstated};
-use densify_run::{DataSpec, DeviceSpec, Fraction, Observer, Silent};
+use densify_run::{DataSpec, DepthSpec, DeviceSpec, Fraction, Observer, Silent};
 use densify_train::exposure::ExposureModel;
 use evaluator::Evaluator;
 use fit::Packing;
@@ -45,6 +45,8 @@ pub struct Options<'a> {
     pub scene: &'a Path,
     /// Options with which the dataset is read.
     pub data: DataSpec,
+    /// Depth options of the training.
+    pub depth: DepthSpec,
     /// Exposure model, if the model was trained with an exposure per photograph.
     pub exposure: Option<ExposureModel>,
     /// Near plane, as a fraction of the scene's extent; `None`: the usual near plane of the dataset.

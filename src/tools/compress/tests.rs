@@ -4,6 +4,7 @@ use std::collections::HashSet;
 
 use super::*;
 use densify_core::gaussians::sh_coefficients;
+use densify_data::dataset::DepthChoice;
 use densify_fixtures::Made;
 use densify_render::BackendChoice;
 use densify_run::Silent;
@@ -40,6 +41,7 @@ fn options<'a>(to: Target, scene: &'a Path, formats: &'a [&'static Format]) -> O
         model: Path::new("model.ply"),
         scene,
         data: DataSpec::default(),
+        depth: DepthSpec::default(),
         exposure: None,
         near: None,
         antialias: None,
@@ -136,4 +138,14 @@ fn colours_stay_as_decoded_from_the_file() {
     assert_eq!((tuned.len(), palette_size(&start)), (256, 256));
     assert!(palette_size(&tuned) <= 256 / 4, "{} entries", palette_size(&tuned));
     assert_ne!(tuned.opacity_logits, [0.0; 256], "the rest is trained");
+}
+
+#[test]
+fn training_has_the_depth_options_of_the_run() {
+    let depth = DepthSpec { depth: Some(DepthChoice::Off), ..DepthSpec::default() };
+    let formats = [sog()];
+    let options =
+        Options { depth: depth.clone(), ..options(Target::Rows(3), Path::new(""), &formats) };
+    let spec = tune::describe_run(&colourful(3), (3, 5), &options, Path::new("scratch.ply"));
+    assert_eq!(spec.expect("described").depth, depth);
 }

@@ -111,13 +111,14 @@ fn stages((whole, rows): (usize, usize), iterations: u32, least_stages: u32) -> 
 }
 
 /// Describes the run of a stage.
-fn describe_run(
+pub(super) fn describe_run(
     model: &Gaussians,
     (budget, iterations): (usize, u32),
     options: &Options<'_>,
     scratch: &Path,
 ) -> Result<RunSpec, Failure> {
-    let mut spec = RunSpec { data: options.data.clone(), ..RunSpec::default() };
+    let mut spec =
+        RunSpec { data: options.data.clone(), depth: options.depth.clone(), ..RunSpec::default() };
     spec.device = options.device.clone();
     spec.start.scene = Some(options.scene.to_owned());
     let file = std::path::absolute(scratch).map_err(Failure::input)?;

@@ -10,8 +10,9 @@ use super::mesh::Mesh;
 use super::nets::BlockNet;
 use super::{Limits, MeshError};
 
-/// Bytes per vertex while the mesh is assembled: position, two triangles, component and its area, and colour.
-const VERTEX_BYTES: u64 = 12 + 2 * 12 + 4 + 8 + 16 + 4;
+/// Bytes per vertex while the mesh is assembled: position, two triangles, which exist twice while those of all blocks are
+/// joined, component and its area, and colour.
+const VERTEX_BYTES: u64 = 12 + 2 * 2 * 12 + 4 + 8 + 16 + 4;
 
 /// Joins the vertices, and drops small components. Returns the mesh in voxels without colours, and the number and the
 /// fraction of the area of the dropped components.
@@ -32,9 +33,11 @@ pub(super) fn assemble(
     // Indices have 32 bits.
     limits.check("the mesh", if count > u64::from(u32::MAX) { u64::MAX } else { 0 }, held)?;
     let joined = Joined { nets: &nets, keys, firsts: &firsts };
-    let triangles: Vec<Vec<[u32; 3]>> =
-        (0..nets.len()).into_par_iter().map(|index| joined.triangles(index)).collect();
-    let triangles = triangles.concat();
+    let triangles = {
+        // Freed as soon as they are joined.
+        let parts = (0..nets.len()).into_par_iter().map(|index| joined.triangles(index));
+        parts.collect::<Vec<_>>().concat()
+    };
     let vertices = nets.iter().flat_map(|net| net.vertices.iter());
     let positions = vertices.map(|vertex| vertex.position).collect();
     drop(nets);
@@ -92,6 +95,7 @@ impl Joined<'_> {
                 });
             }
         }
+        triangles.shrink_to_fit();
         triangles
     }
 

@@ -39,15 +39,27 @@ pub(super) struct Grid {
     pub(super) voxel: f64,
     /// Number of blocks along each axis.
     blocks: Place,
+    /// Number of cells between voxels along each axis.
+    cells: Place,
 }
 
 impl Grid {
     /// The grid of a region; `None` if it has too many blocks along an axis.
     pub(super) fn new(region: &Region, voxel: f64) -> Option<Self> {
-        let blocks = ((region.high - region.low) / (voxel * SIDE as f64)).ceil() + 1.0;
+        // Cells end inside the region, unless it is thinner than one of them.
+        let cells = ((region.high - region.low) / voxel).floor().max(DVec3::ONE);
+        let blocks = (cells / SIDE as f64).floor() + 1.0;
         let fits = blocks.is_finite() && blocks.max_element() < f64::from(1 << (BITS - 1));
-        let blocks = blocks.to_array().map(|count| count as i32);
-        (fits && voxel > 0.0).then_some(Self { low: region.low, voxel, blocks })
+        let [cells, blocks] =
+            [cells, blocks].map(|counts| counts.to_array().map(|count| count as i32));
+        (fits && voxel > 0.0).then_some(Self { low: region.low, voxel, blocks, cells })
+    }
+
+    /// Number of cells of a block that are inside the region, along each axis.
+    pub(super) fn cells_of(&self, block: Place) -> [usize; 3] {
+        [0, 1, 2].map(|axis| {
+            (self.cells[axis] - block[axis] * SIDE as i32).clamp(0, SIDE as i32) as usize
+        })
     }
 
     /// Adds the blocks with a voxel closer to a scene point than the truncation, along every axis.

@@ -33,7 +33,7 @@ impl Region {
 pub(super) struct Extent {
     /// The part of space to fuse.
     pub(super) region: Region,
-    /// Diagonal of the scene's box `[scene units]`.
+    /// Diagonal of the scene's box, or of the given region `[scene units]`.
     pub(super) diagonal: f64,
 }
 

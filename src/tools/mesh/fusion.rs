@@ -51,10 +51,11 @@ pub(super) fn fuse(
             integrate(frame, grid, &loaded, &mut voxels);
             Ok::<_, MeshError>(())
         })?;
-        let extracted = keys[range].par_iter().map(|&key| nets::extract(key, &loaded, &voxels));
+        let extracted =
+            keys[range].par_iter().map(|&key| nets::extract(grid, key, &loaded, &voxels));
         let extracted: Vec<BlockNet> = extracted.collect();
         held += extracted.iter().map(BlockNet::bytes).sum::<u64>();
-        limits.check("the surface", 0, held)?;
+        limits.check("the surface", held, 0)?;
         nets.extend(extracted);
         passes += 1;
     }

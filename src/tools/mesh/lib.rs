@@ -57,7 +57,7 @@ pub trait DepthSource {
 /// Options of [`fuse`].
 #[derive(Debug, Clone, Copy)]
 pub struct FuseOptions {
-    /// Length of a voxel `[scene units]`, > 0; `None`: [`VOXELS`] per diagonal of the scene.
+    /// Length of a voxel `[scene units]`, > 0; `None`: [`VOXELS`] per diagonal of the scene or region.
     pub voxel: Option<f64>,
     /// The part of space to fuse; `None`: around the seen points.
     pub region: Option<Region>,
@@ -69,7 +69,7 @@ pub struct FuseOptions {
     pub unit: f64,
 }
 
-/// Default number of voxels along the scene's diagonal.
+/// Default number of voxels along the diagonal of the scene or region.
 pub const VOXELS: f64 = 256.0;
 
 /// The distance from the surface at which signed distances are truncated `[voxels]`: half a block.
@@ -82,7 +82,7 @@ pub struct Fused {
     pub mesh: Mesh,
     /// Length of a voxel `[scene units]`.
     pub voxel: f64,
-    /// Diagonal of the box around the scene's seen points `[scene units]`.
+    /// Diagonal of the box around the scene's seen points, or of the given region `[scene units]`.
     pub diagonal: f64,
     /// Number of blocks of 8³ voxels.
     pub blocks: usize,
@@ -105,7 +105,7 @@ pub enum MeshError {
     Nothing,
     /// The grid or the mesh does not fit into the memory, even in passes.
     #[error(
-        "the memory is too small for voxels of {voxel} (1/{} of the scene's diagonal): {part} takes {}, and {} is left",
+        "the memory is too small for voxels of {voxel} (1/{} of the {span}'s diagonal): {part} takes {}, and {} is left",
         (diagonal / voxel).round(), Bytes(*needed), Bytes(*left)
     )]
     Memory {
@@ -117,16 +117,20 @@ pub enum MeshError {
         left: u64,
         /// Length of a voxel `[units of the dataset]`.
         voxel: f64,
-        /// Diagonal of the scene `[units of the dataset]`.
+        /// Diagonal of the scene or of the given region `[units of the dataset]`.
         diagonal: f64,
+        /// "scene" or "box": has the diagonal.
+        span: &'static str,
     },
     /// The grid has too many voxels along an axis.
-    #[error("voxels of {voxel} are too small for a scene with a diagonal of {diagonal}")]
+    #[error("voxels of {voxel} are too small for a {span} with a diagonal of {diagonal}")]
     TooFine {
         /// Length of a voxel `[units of the dataset]`.
         voxel: f64,
-        /// Diagonal of the scene `[units of the dataset]`.
+        /// Diagonal of the scene or of the given region `[units of the dataset]`.
         diagonal: f64,
+        /// "scene" or "box": has the diagonal.
+        span: &'static str,
     },
     /// Nothing is left of the surface.
     #[error("no surface was found: the views contradict each other")]
@@ -160,13 +164,14 @@ pub fn fuse(
     let extent = extent::survey(&mut frames, options.region)?;
     let diagonal = extent.diagonal;
     let voxel = options.voxel.unwrap_or(diagonal / VOXELS);
-    let limits = Limits { memory, voxel: voxel / options.unit, diagonal: diagonal / options.unit };
-    let Limits { voxel: told, diagonal: told_diagonal, .. } = limits;
-    let too_fine = MeshError::TooFine { voxel: told, diagonal: told_diagonal };
+    let (told, told_diagonal) = (voxel / options.unit, diagonal / options.unit);
+    let span = if options.region.is_some() { "box" } else { "scene" };
+    let limits = Limits { memory, voxel: told, diagonal: told_diagonal, span };
+    let too_fine = MeshError::TooFine { voxel: told, diagonal: told_diagonal, span };
     let grid = Grid::new(&extent.region, voxel).ok_or(too_fine)?;
     let keys = blocks::collect(&mut frames, &grid, &limits)?;
     observer.say(format_args!(
-        "grid     {} blocks of 8³ voxels of {told:.4} (1/{:.0} of the scene's diagonal)",
+        "grid     {} blocks of 8³ voxels of {told:.4} (1/{:.0} of the {span}'s diagonal)",
         densify_core::numbers::grouped(keys.len()),
         diagonal / voxel
     ));
@@ -187,17 +192,19 @@ struct Limits {
     memory: u64,
     /// Length of a voxel `[units of the dataset]`.
     voxel: f64,
-    /// Diagonal of the scene `[units of the dataset]`.
+    /// Diagonal of the scene or of the given region `[units of the dataset]`.
     diagonal: f64,
+    /// "scene" or "box": has the diagonal.
+    span: &'static str,
 }
 
 impl Limits {
     /// Fails unless `part` fits beside what is `held` already.
     fn check(&self, part: &'static str, needed: u64, held: u64) -> Result<(), MeshError> {
         let left = self.memory.saturating_sub(held);
-        let Self { voxel, diagonal, .. } = *self;
+        let Self { voxel, diagonal, span, .. } = *self;
         if needed > left {
-            return Err(MeshError::Memory { part, needed, left, voxel, diagonal });
+            return Err(MeshError::Memory { part, needed, left, voxel, diagonal, span });
         }
         Ok(())
     }

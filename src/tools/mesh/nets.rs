@@ -3,7 +3,7 @@
 
 use glam::Vec3;
 
-use super::blocks::{Key, SIDE, add, block, corner, key};
+use super::blocks::{Grid, Key, SIDE, add, block, corner, key};
 use super::fusion::{Voxel, Voxels};
 
 /// Samples along a block's side with one layer of the next block, which both share.
@@ -70,8 +70,8 @@ impl BlockNet {
     }
 }
 
-/// Extracts the vertices of a block. `keys` has it and the blocks beyond its upper sides, as far as they exist.
-pub(super) fn extract(own: Key, keys: &[Key], voxels: &[Voxels]) -> BlockNet {
+/// Extracts the vertices of a block inside the grid's region. `keys` has it and the blocks beyond its upper sides, as far as they exist.
+pub(super) fn extract(grid: &Grid, own: Key, keys: &[Key], voxels: &[Voxels]) -> BlockNet {
     let here = block(own);
     let blocks: [Option<&Voxels>; 8] = std::array::from_fn(|i| {
         let next = key(add(here, corner(i)));
@@ -87,11 +87,12 @@ pub(super) fn extract(own: Key, keys: &[Key], voxels: &[Voxels]) -> BlockNet {
             }
         }
     }
+    let [width, height, depth] = grid.cells_of(here);
     let first = Vec3::from(here.map(|at| (at * SIDE as i32) as f32));
     let mut vertices = Vec::new();
-    for z in 0..SIDE {
-        for y in 0..SIDE {
-            for x in 0..SIDE {
+    for z in 0..depth {
+        for y in 0..height {
+            for x in 0..width {
                 let corners: [Voxel; 8] =
                     std::array::from_fn(|i| samples[z + (i >> 2)][y + (i >> 1 & 1)][x + (i & 1)]);
                 let Some((within, edges)) = net_vertex(&corners) else { continue };

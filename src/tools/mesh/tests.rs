@@ -116,7 +116,7 @@ fn a_sphere_becomes_a_closed_surface_of_its_colours() {
 fn passes_and_threads_change_nothing() {
     let whole = fused(&SPHERE).unwrap();
     assert!(whole.blocks > 200, "{}", whole.blocks);
-    let small = fused(&FuseOptions { memory: 1 << 20, ..SPHERE }).unwrap();
+    let small = fused(&FuseOptions { memory: 5 << 18, ..SPHERE }).unwrap();
     assert!(small.passes > 2, "{}", small.passes);
     assert!(small.mesh == whole.mesh);
     for threads in [1, 3] {
@@ -144,6 +144,18 @@ fn a_region_cuts_the_surface() {
     let cut = fused(&FuseOptions { region: Some(upper), ..SPHERE }).unwrap().mesh;
     let lowest = (0..cut.positions.len()).map(|i| cut.place_of(i).y).fold(9.0, f64::min);
     assert!((0.3..0.36).contains(&lowest), "{lowest}");
+    // The upper sides are kept as well, wherever they are within a block.
+    for y in [-0.62, 0.11, 0.3] {
+        let high = DVec3::new(2.0, y, 0.5);
+        let region = Region { low: DVec3::splat(-2.0), high };
+        let cut = fused(&FuseOptions { region: Some(region), ..SPHERE }).unwrap().mesh;
+        let places = (0..cut.positions.len()).map(|i| cut.place_of(i));
+        let highest = places.reduce(DVec3::max).unwrap();
+        for axis in [1, 2] {
+            let beyond = highest[axis] - high[axis];
+            assert!((-0.1..1e-6).contains(&beyond), "{highest}, {high}");
+        }
+    }
 }
 
 #[test]

@@ -1,10 +1,35 @@
 //! `densify clean`: what it removes and reports, and refused calls.
 
+use std::cell::Cell;
+use std::path::Path;
+
+use densify::clean::{Options, Rules, clean};
 use densify::core::gaussians::{Gaussians, logit, rgb_to_dc};
 use densify::data::models::PLY;
+use densify::render::BackendChoice;
+use densify::run::{DataSpec, DepthSpec, DeviceSpec, Interrupt, Observer};
 
-use super::{call, gaussians, read, scratch, text, train};
-use crate::photographs::Photographs;
+use super::{call, gaussians, read, read_text, scratch, text, train};
+use crate::photographs::{Photographs, VIEWS, camera};
+
+/// The model, and more small grey Gaussians at one place.
+fn with_more(
+    model: &Gaussians,
+    count: usize,
+    place: [f32; 3],
+    (scale, opacity): (f32, f32),
+) -> Gaussians {
+    let mut more = Gaussians::zeros(count, 0).with_degree(model.sh_degree);
+    more.antialiasing = model.antialiasing;
+    more.means.fill(place);
+    more.quats.fill([1.0, 0.0, 0.0, 0.0]);
+    more.log_scales.fill([scale.ln(); 3]);
+    more.opacity_logits.fill(logit(opacity));
+    more.sh.fill(rgb_to_dc(0.5));
+    let mut all = model.clone();
+    all.append(more);
+    all
+}
 
 #[test]
 fn floaters_go_and_the_model_stays() {
@@ -14,18 +39,12 @@ fn floaters_go_and_the_model_stays() {
     let model = run.join("point_cloud/iteration_60/point_cloud.ply");
     let original = read(&model);
     // Ten Gaussians that no view shows, because they are as good as transparent.
-    let mut changed: Gaussians = gaussians(&model);
-    let rows = changed.len();
-    let mut extra = Gaussians::zeros(10, 0).with_degree(changed.sh_degree);
-    extra.antialiasing = changed.antialiasing;
-    extra.quats.fill([1.0, 0.0, 0.0, 0.0]);
-    extra.log_scales.fill([-5.0; 3]);
-    extra.opacity_logits.fill(logit(1e-4));
-    extra.sh.fill(rgb_to_dc(0.5));
-    changed.append(extra);
+    let trained: Gaussians = gaussians(&model);
+    let rows = trained.len();
+    let changed = with_more(&trained, 10, [0.0; 3], (0.007, 1e-4));
     let with_unseen = root.path().join("unseen.ply");
     PLY.save(&changed, &with_unseen).expect("a model");
-    let clean = |from: &std::path::Path, name: &str, flags: &str| {
+    let clean = |from: &Path, name: &str, flags: &str| {
         let output = root.path().join(name);
         (call(&format!("clean {} -o {} {flags}", text(from), text(&output))), output)
     };
@@ -53,6 +72,14 @@ fn floaters_go_and_the_model_stays() {
     outcome.ok();
     assert!(read(&again) == read(&cleaned));
     assert!(read(&model) == original);
+    // Refining has the depth options of the run.
+    let config = run.join("config.toml");
+    let original_config = read_text(&config);
+    std::fs::write(&config, format!("distortion_weight = 100\n{original_config}")).expect("write");
+    let (outcome, with_distortion) = clean(&run, "e.ply", "--rounds 9 --refine 10 --backend cpu");
+    outcome.ok();
+    assert!(read(&with_distortion) != read(&cleaned));
+    std::fs::write(&config, original_config).expect("write");
 
     let path = text(&model);
     for (from, name, flags, words) in [
@@ -60,6 +87,7 @@ fn floaters_go_and_the_model_stays() {
         (&run, "d.xyz", "", &["-o:", "--format"]),
         (&run, "a.ply", "", &["a.ply exists", "--overwrite"]),
         (&run, "d.ply", "--margin 1.5", &["--margin"]),
+        (&run, "d.ply", "--isolated 1.5", &["--isolated", "from 0 to 1"]),
         (&run, "d.ply", "--box 1,1,1,0,0,0", &["--box", "smallest"]),
         (&run, "d.ply", "--box 900,900,900,901,901,901", &["no Gaussian would be left", "box"]),
         (&run, "d.ply", "--eval", &["--eval"]),
@@ -74,4 +102,90 @@ fn floaters_go_and_the_model_stays() {
         call(&words).refused("the model itself", &["is the model itself"]);
     }
     assert!(read(&model) == original);
+}
+
+#[test]
+fn an_opaque_floater_near_a_camera_goes_and_the_surface_stays() {
+    let scene = Photographs::colmap_text();
+    let (root, run) = scratch();
+    train(scene.path(), &run, 60, "--budget 300 --eval --quiet").ok();
+    let model = gaussians(&run.join("point_cloud/iteration_60/point_cloud.ply"));
+    // On the optical axis of a training view, at a fifth of the distance of what it shows.
+    let place = (0.8 * camera(1).centre()).as_vec3().to_array();
+    let cleaned = |model: &Gaussians, flags: &str| {
+        let (from, to) = (root.path().join("from.ply"), root.path().join("to.ply"));
+        PLY.save(model, &from).expect("a model");
+        let flags = format!("--isolated 0 --keep-unseen --overwrite {flags}");
+        call(&format!(
+            "clean {} -o {} --scene {} {flags}",
+            text(&from),
+            text(&to),
+            text(scene.path())
+        ))
+        .ok();
+        gaussians(&to)
+    };
+    let has_floater = |model: &Gaussians| model.means.contains(&place);
+    let planted = with_more(&model, 1, place, (0.05, 0.9));
+    assert!(has_floater(&cleaned(&planted, "--keep-in-front")));
+    let (with, without) = (cleaned(&planted, ""), cleaned(&model, ""));
+    assert!(!has_floater(&with));
+    // All others are judged as if there were no floater.
+    let stays = |mean: &&[f32; 3]| with.means.contains(*mean);
+    let stayed = without.means.iter().filter(stays).count();
+    assert!(without.len() > model.len() / 2, "{} of {}", without.len(), model.len());
+    assert!(stayed * 20 >= without.len() * 19, "{stayed} of {}", without.len());
+}
+
+/// Asks to stop after some questions.
+struct Stopping {
+    questions: Cell<usize>,
+    after: usize,
+}
+
+impl Observer for Stopping {
+    fn interrupt(&self) -> Option<Interrupt> {
+        self.questions.set(self.questions.get() + 1);
+        (self.questions.get() > self.after).then_some(Interrupt { name: "SIGINT", exit_code: 130 })
+    }
+}
+
+#[test]
+fn a_signal_stops_between_any_two_views() {
+    let scene = Photographs::colmap_text();
+    let (root, run) = scratch();
+    train(scene.path(), &run, 20, "--budget 300 --eval --quiet").ok();
+    let model = run.join("point_cloud/iteration_20/point_cloud.ply");
+    let output = root.path().join("a.ply");
+    let options = Options {
+        model: &model,
+        scene: scene.path(),
+        data: DataSpec { eval: true, ..DataSpec::default() },
+        depth: DepthSpec::default(),
+        exposure: None,
+        near: None,
+        antialias: None,
+        device: DeviceSpec { backend: BackendChoice::Cpu, ..DeviceSpec::default() },
+        rules: Rules { keep_box: None, unseen: true, in_front: true, margin: 0.05, isolated: 0.0 },
+        rounds: 1,
+        refine: 0,
+        seed: 0,
+        output: &output,
+    };
+    let clean_until = |after: usize| {
+        let observer = Stopping { questions: Cell::new(0), after };
+        (clean(&options, &observer), observer.questions.get())
+    };
+    // Test views before and after, and training views in between.
+    let test_views = VIEWS.div_ceil(8);
+    let views = VIEWS + test_views;
+    let (cleaned, questions) = clean_until(usize::MAX);
+    assert!(cleaned.is_ok() && questions == views, "{questions}: {cleaned:?}");
+    for after in [0, test_views + 1, views - 1] {
+        let (cleaned, questions) = clean_until(after);
+        let failure = cleaned.expect_err("stopped");
+        assert_eq!((failure.code, questions), (130, after + 1), "{failure}");
+        assert!(failure.to_string().contains("stopped by SIGINT"), "{failure}");
+    }
+    assert!(!output.exists());
 }

@@ -250,6 +250,10 @@ fn unsuitable_models_are_refused_or_reported() {
     let dataset = format!("--scene {} --test-every 2 --backend cpu", text(scene.path()));
     let compress = format!("compress {} --to 50 -o {} {dataset}", text(&tenfold), text(&small));
     call(&compress).refused("compress", &expected);
+    let clean = format!("clean {} -o {} {dataset}", text(&tenfold), text(&small));
+    call(&clean).refused("clean", &expected);
+    let mesh = format!("mesh {} -o {} {dataset}", text(&tenfold), text(&small));
+    call(&mesh).refused("mesh", &expected);
     std::fs::remove_file(&tenfold).unwrap();
     assert!(files(root.path()) == before);
     // A model with little resemblance gets a warning.

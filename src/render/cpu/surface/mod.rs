@@ -3,7 +3,7 @@
 //!
 //! Blending is replayed front to back with the arithmetic of the forward pass, as in [`observe`](super::observe). The
 //! first replay uses the canvas's colours, which nobody reads, for its results. The second one reads the surface from
-//! the plane of the image gradient that training leaves at 0, and writes one record per (row, tile).
+//! the image gradient's plane for depth, which is set to 0 afterwards, and writes one record per (row, tile).
 
 use std::sync::atomic::{AtomicU32, AtomicU64, Ordering::Relaxed};
 
@@ -17,6 +17,7 @@ use super::rasterize::{
     ALPHA_MAX, Blending, DEPTH, DepthPlane, PATCHES, Plane, TRANSMITTANCE, TileCanvas, TilePlace,
     ZERO_PLANE,
 };
+use super::rasterize_bwd::BY_DEPTH;
 use super::records::{Sums, TileRecords, gather_all, parts};
 use super::simd::{V, WIDTH};
 use super::tiles::{Entry, Visible};
@@ -29,8 +30,6 @@ const MEDIAN: usize = 0;
 const SQUARES: usize = 1;
 /// Values per record: weight in front of the surface, and whole weight.
 const STRIDE: usize = 2;
-/// The plane of a tile's gradient that temporarily holds the surface.
-const SURFACE: usize = 3;
 
 impl CpuBackend {
     /// Renders the depths of a view.
@@ -99,9 +98,9 @@ impl CpuBackend {
         let Frame { grid, bands, .. } = &frame?;
         assert_eq!(surface.len(), grid.width * grid.height, "one depth per pixel");
         for (tile, gradient) in self.gradient[..grid.tiles()].iter_mut().enumerate() {
-            gradient.planes[SURFACE] = ZERO_PLANE;
+            gradient.planes[BY_DEPTH] = ZERO_PLANE;
             for_each_pixel(grid, tile, |patch, lane, at| {
-                gradient.planes[SURFACE][patch][lane] = surface[at];
+                gradient.planes[BY_DEPTH][patch][lane] = surface[at];
             });
         }
         let blending = self.shortcuts.into();
@@ -126,7 +125,7 @@ impl CpuBackend {
                             list: lists.of_tile(i),
                             place: TilePlace::new(grid, tile),
                             blending,
-                            surface: &gradient[tile].planes[SURFACE],
+                            surface: &gradient[tile].planes[BY_DEPTH],
                             records: part.records(lists, i, records, STRIDE),
                             batch,
                         });
@@ -141,7 +140,7 @@ impl CpuBackend {
             }
         });
         for gradient in &mut gradient[..grid.tiles()] {
-            gradient.planes[SURFACE] = ZERO_PLANE;
+            gradient.planes[BY_DEPTH] = ZERO_PLANE;
         }
         let is_seen = |row: usize| visible[row / WIDTH] >> (row % WIDTH) & 1 == 1;
         let weights = |row: usize| match is_seen(row) {
