@@ -3,7 +3,6 @@
 //! Blender's background is 1e10, 65504 in half floats, or infinite; all of them count as unknown.
 
 use std::io::Cursor;
-use std::panic::catch_unwind;
 
 use exr::meta::MetaData;
 use exr::meta::header::Header;
@@ -71,14 +70,14 @@ pub(super) fn read(source: &SourceFile) -> Result<Values, LoadError> {
     let bytes = raw::bytes(source)?;
     let start = &bytes[..bytes.len().min(HEADER_BYTES as usize)];
     let (header, name) = parse(source, start, bytes.len() as u64)?;
-    let image = catch_unwind(|| {
-        let reader = reader().no_deep_data().largest_resolution_level().all_channels();
-        let reader = reader.first_valid_layer().all_attributes().non_parallel();
-        reader.from_buffered(Cursor::new(&*bytes))
-    });
-    // The decoder panics at some contradictions in a file.
-    let image =
-        image.map_err(|_| malformed(&source.path, "the pixels", "they contradict the header"))?;
+    let image = reader()
+        .no_deep_data()
+        .largest_resolution_level()
+        .all_channels()
+        .first_valid_layer()
+        .all_attributes()
+        .non_parallel()
+        .from_buffered(Cursor::new(&*bytes));
     let image = image.map_err(|error| malformed(&source.path, "the pixels", error))?;
     let list = &image.layer_data.channel_data.list;
     let channel = list.iter().find(|channel| channel.name.to_string() == name);

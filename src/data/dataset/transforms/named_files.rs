@@ -102,7 +102,7 @@ impl Fields<'_> {
         } else {
             root.existing_on_any_system(named)?
         };
-        let Some(path) = found else { return folders.depth(image, listed) };
+        let Some(path) = found else { return folders.depth(image, photograph) };
         let Some(depth) = DepthFile::new(path) else {
             let problem = format!("{value:?} is no PNG, NumPy or OpenEXR file");
             return Err(self.fault("depth_file_path", problem));
