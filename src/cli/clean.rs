@@ -23,9 +23,12 @@ use densify_train::evaluate::Split;
 ///
 /// Removes Gaussians with over half of their weight (α·T, over all pixels of the training views) in front of the
 /// surface, which is the median depth of each pixel as the model itself shows it (depth maps of the dataset are not
-/// used); Gaussians that no training view shows; small groups far from all others; and, with --box, what is outside. Prints how many Gaussians each rule removed, and
-/// the change in PSNR of the test views (of the training views, if no views are held out). Floaters often hide errors of
-/// the surface behind them, so PSNR falls at first; --refine trains the rest further, without new Gaussians.
+/// used); Gaussians that no training view shows; small groups far from all others; and, with --box, what is outside.
+/// Prints how many Gaussians each rule removed, and the change in PSNR of the test views (of the training views, if no
+/// views are held out). Floaters often hide errors of the surface behind them, so PSNR falls at first; --refine trains
+/// the rest further, without new Gaussians.
+///
+/// Floaters that are nearly opaque count as surface, since the median depth is their own.
 #[derive(Debug, Args)]
 #[command(after_help = EXAMPLES)]
 pub(super) struct CleanArgs {

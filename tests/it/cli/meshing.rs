@@ -49,12 +49,15 @@ fn meshes_of_all_formats_are_scored_alike() {
     }
     // Neither threads nor passes change the file; a model file gives the same mesh as its run.
     // The least memory that suffices depends on the program's own size.
-    let outcomes = (32..512)
-        .step_by(8)
-        .map(|mebibytes| mesh("b.ply", &format!("--threads 1 --memory {mebibytes}MiB")));
+    let outcomes = (32..512).step_by(8).map(|mebibytes| {
+        mesh("e.ply", &format!("--voxel 0.01 --threads 1 --memory {mebibytes}MiB"))
+    });
     let stdout =
         outcomes.into_iter().find(|outcome| outcome.code == Some(0)).expect("enough").stdout;
     assert!(stdout.contains(" passes, within the memory"), "{stdout}");
+    mesh("d.ply", "--voxel 0.01 --memory 2GiB").ok();
+    assert!(read(&file("e.ply")) == read(&file("d.ply")));
+    mesh("b.ply", "--threads 1").ok();
     let model = run.join("point_cloud/iteration_100/point_cloud.ply");
     let scene_flag = format!("--scene {} --eval", text(&scene));
     call(&format!("mesh {} -o {} {scene_flag}", text(&model), text(&file("c.ply")))).ok();
