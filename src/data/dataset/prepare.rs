@@ -142,11 +142,9 @@ pub(super) fn assemble(
         options,
         &mut notes,
     )?;
-    let root = path.to_owned();
-    let unpacked = None;
     Ok(Dataset {
-        root,
-        unpacked,
+        root: path.to_owned(),
+        unpacked: None,
         train,
         test,
         points,

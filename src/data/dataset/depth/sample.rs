@@ -4,6 +4,8 @@
 //! neighbours differ by more than 5 %, the confidence is 0, because sensors mix the two surfaces there. In noisy maps
 //! the limit is higher, or hardly any pixel would be left.
 
+use std::borrow::Cow;
+
 use glam::DVec2;
 
 use super::super::LoadError;
@@ -19,6 +21,9 @@ const EDGE: f32 = 0.05;
 const NOISE: f32 = 4.0;
 /// Number of pixels, at equal intervals, in which the median difference is measured.
 const MEASURED: usize = 4096;
+
+/// The values of a file, the number of negative ones, and their confidences, if there are any.
+type Stored<'a> = (Cow<'a, Values>, usize, Option<Vec<u8>>);
 
 /// Inverse depths of a view and their confidences.
 #[derive(Debug, Clone, PartialEq)]
@@ -101,9 +106,8 @@ impl DepthSource {
         Ok(sampled)
     }
 
-    /// The values of the file, turned like the photograph, the number of negative ones, and their confidences.
-    fn values(&self) -> Result<(std::borrow::Cow<'_, Values>, usize, Option<Vec<u8>>), LoadError> {
-        use std::borrow::Cow;
+    /// The values of the file and their confidences, turned like the photograph.
+    fn values(&self) -> Result<Stored<'_>, LoadError> {
         let MapFile { file, kind, header, confidence, turn } = match &self.from {
             From::File(map) => &**map,
             From::Rendered(values) => return Ok((Cow::Borrowed(values), 0, None)),
