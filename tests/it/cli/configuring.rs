@@ -62,6 +62,13 @@ fn config_toml_contains_every_option_of_a_run() {
     let unset = [
         "test_every",
         "antialias",
+        "depth",
+        "depth_unit",
+        "depth_along",
+        "depth_points",
+        "depth_weight",
+        "depth_term",
+        "distortion_weight",
         "images",
         "resolution",
         "init_points",
