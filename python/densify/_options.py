@@ -66,6 +66,27 @@ class Options(TypedDict, total=False):
     near: float
     """Smallest distance from a camera at which anything is rendered, as a fraction of the scene's extent (default: 0.04, or less where the views show points that are nearer)"""
 
+    depth: str
+    """Use of depth maps that the dataset has: files named by depth_file_path in transforms.json; depth/ or depths/ with the names of the photographs (16-bit PNG, .npy, .exr), and confidence/ beside them; COLMAP's stereo/depth_maps, and depths/ with sparse/0/depth_params.json (default: auto)"""
+
+    depth_unit: float | str
+    """Length of one step of the values in the dataset's units, such as 0.001, 1/5000 (TUM) or 1/6553.5 (Replica); relative: inverse depth up to scale and offset, as monocular networks estimate it, which are fitted to the points that each view sees (default: 0.001 for PNG and .npy, 1 for .exr and COLMAP)"""
+
+    depth_along: str
+    """What the values measure (default: axis)"""
+
+    depth_points: StrPath
+    """Point cloud in the dataset's coordinates (PLY or LAS), such as a laser scan, to be projected into the views instead of reading depth maps. If the dataset has no points, training starts from these"""
+
+    depth_weight: float | str
+    """Weight of the depth term, at the first and at the last iteration; one number: the same throughout (default: 0.05:0.001)"""
+
+    depth_term: str
+    """Term that compares depth: expected compares the mean inverse depth along a ray, samples that of each Gaussian (default: expected)"""
+
+    distortion_weight: float
+    """Weight of a term that gathers the Gaussians along each ray, after a third of the run; needs no given depth (default: 0)"""
+
     budget: int | str
     """Maximum number of Gaussians in the model: 200000, 28k, 1.5M (default: 200k, or as many as --memory holds)"""
 
