@@ -33,6 +33,7 @@ mod rasterize;
 mod rasterize_bwd;
 mod records;
 mod regularise;
+mod replay;
 mod signals;
 mod simd;
 mod stage_clock;

@@ -1,9 +1,8 @@
 //! Auxiliary views: training views that are rendered for a policy's edit, with statistics per Gaussian.
 //!
-//! Blending is replayed front to back with the arithmetic of the forward pass. Each row's sums over the pixels that
-//! it is blended into, and its largest weight, go to one record per (row, tile); the records of a row are added in
-//! order of tile number. Records and sums use the backward pass's buffers, and the pixel map uses the alpha plane of
-//! the image gradient.
+//! Blending is [replayed](super::replay). Each row's sums over the pixels that it is blended into, and its largest
+//! weight, go to one record per (row, tile); the records of a row are added in order of tile number. Records and sums
+//! use the backward pass's buffers, and the pixel map uses the alpha plane of the image gradient.
 
 use std::sync::atomic::{AtomicU32, AtomicU64, Ordering::Relaxed};
 
@@ -15,9 +14,10 @@ use super::loss::ErrorRequests;
 use super::passes::{Frame, for_each_pixel, scalars};
 use super::project::Splat;
 use super::rasterize::{
-    ALPHA_MAX, Blending, DepthPlane, PATCHES, Plane, TRANSMITTANCE, TilePlace, ZERO_PLANE,
+    Blending, DepthPlane, PATCHES, Plane, TRANSMITTANCE, TilePlace, ZERO_PLANE,
 };
 use super::records::{Sums, TileRecords, gather_all, parts};
+use super::replay::{Blended, blend, is_finished};
 use super::simd::{V, WIDTH};
 use super::tiles::{Entry, Grid, Visible};
 use super::{AuxInput, AuxOutput, BackendError, CpuBackend};
@@ -194,9 +194,7 @@ impl WithSimd for Replay<'_> {
     fn with_simd<S: Simd>(self, s: S) {
         let Self { splats, list, place, blending, map, records, batch } = self;
         let c = |x: f32| V::splat(s, x);
-        let min_transmittance = c(blending.transmittance_min);
         let zero = V::zero(s);
-        // Transmittance of unfinished pixels; 0 for finished ones and outside the image.
         let (mut transmittance, mut unfinished) = place.inside();
         for (n, chunk) in list.chunks(BATCH).enumerate() {
             batch.set(s, splats, chunk, &place);
@@ -209,29 +207,18 @@ impl WithSimd for Replay<'_> {
                     let p = todo.trailing_zeros() as usize % PATCHES;
                     todo &= todo - 1;
                     for at in (0..WIDTH).step_by(S::F32_LANES) {
-                        let [u, z] = batch.u_and_z(s, i, p, at);
-                        let e = u.neg_mul_add(u, z.neg_mul_add(z, c(splat.log2_opacity)));
-                        let seen = c(-blending.log2_reach).le(e);
-                        let alpha = e.exp2().min(c(ALPHA_MAX));
-                        let t = V::load(s, &transmittance[p][at..]);
-                        let next = alpha.neg_mul_add(t, t);
-                        let blends = min_transmittance.lt(next).and(seen);
+                        let Blended { blends, weight, .. } =
+                            blend(s, batch, blending, [i, p, at], &mut transmittance[p]);
                         let dx = V::load(s, &LANE_X[at..]) + (CORNER_X[p] - mx);
                         let dy = V::load(s, &LANE_Y[at..]) + (CORNER_Y[p] - my);
                         let distance = (dx * dx + dy * dy).sqrt();
                         sums[0] = sums[0] + blends.keep(V::load(s, &map[p][at..]));
                         sums[1] = sums[1] + blends.keep(c(1.0));
-                        let weight = blends.keep(alpha * t);
                         sums[2] = sums[2] + weight;
                         sums[3] = sums[3] + blends.keep(distance);
                         sums[MAXIMUM] = sums[MAXIMUM].max(weight);
-                        let stopped = next.le(min_transmittance).and(seen);
-                        let remaining = stopped.select(zero, blends.select(next, t));
-                        remaining.store(&mut transmittance[p][at..]);
                     }
-                    #[expect(clippy::float_cmp, reason = "finished pixels have exactly 0")]
-                    let all_stopped = transmittance[p] == [0.0; WIDTH];
-                    if all_stopped {
+                    if is_finished(&transmittance[p]) {
                         unfinished &= !(1 << p);
                     }
                 }

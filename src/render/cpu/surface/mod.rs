@@ -1,9 +1,9 @@
 //! The surface that the model shows in a view: median depth, the spread of depths along each ray, and the weight that
 //! each row has in front of a given surface.
 //!
-//! Blending is replayed front to back with the arithmetic of the forward pass, as in [`observe`](super::observe). The
-//! first replay uses the canvas's colours, which nobody reads, for its results. The second one reads the surface from
-//! the image gradient's plane for depth, which is set to 0 afterwards, and writes one record per (row, tile).
+//! Blending is [replayed](super::replay). The first replay uses the canvas's colours, which nobody reads, for its
+//! results. The second one reads the surface from the image gradient's plane for depth, which is set to 0 afterwards,
+//! and writes one record per (row, tile).
 
 use std::sync::atomic::{AtomicU32, AtomicU64, Ordering::Relaxed};
 
@@ -14,11 +14,11 @@ use super::batch::{BATCH, Batch};
 use super::passes::{Frame, for_each_pixel};
 use super::project::Splat;
 use super::rasterize::{
-    ALPHA_MAX, Blending, DEPTH, DepthPlane, PATCHES, Plane, TRANSMITTANCE, TileCanvas, TilePlace,
-    ZERO_PLANE,
+    Blending, DEPTH, DepthPlane, PATCHES, Plane, TRANSMITTANCE, TileCanvas, TilePlace, ZERO_PLANE,
 };
 use super::rasterize_bwd::BY_DEPTH;
 use super::records::{Sums, TileRecords, gather_all, parts};
+use super::replay::{Blended, blend, is_finished};
 use super::simd::{V, WIDTH};
 use super::tiles::{Entry, Visible};
 use super::{BackendError, CpuBackend};
@@ -171,8 +171,7 @@ impl WithSimd for Depths<'_> {
     fn with_simd<S: Simd>(self, s: S) {
         let Self { splats, list, place, blending, canvas, batch } = self;
         let c = |x: f32| V::splat(s, x);
-        let min_transmittance = c(blending.transmittance_min);
-        let (zero, half) = (V::zero(s), c(0.5));
+        let half = c(0.5);
         let [median, squares, ..] = &mut canvas.planes;
         (*median, *squares) = (ZERO_PLANE, ZERO_PLANE);
         let (mut transmittance, mut unfinished) = place.inside();
@@ -189,27 +188,16 @@ impl WithSimd for Depths<'_> {
                     let p = todo.trailing_zeros() as usize % PATCHES;
                     todo &= todo - 1;
                     for at in (0..WIDTH).step_by(S::F32_LANES) {
-                        let [u, z] = batch.u_and_z(s, i, p, at);
-                        let e = u.neg_mul_add(u, z.neg_mul_add(z, c(splat.log2_opacity)));
-                        let seen = c(-blending.log2_reach).le(e);
-                        let alpha = e.exp2().min(c(ALPHA_MAX));
-                        let t = V::load(s, &transmittance[p][at..]);
-                        let next = alpha.neg_mul_add(t, t);
-                        let blends = min_transmittance.lt(next).and(seen);
-                        let weight = blends.keep(alpha * t);
+                        let Blended { blends, weight, before, after } =
+                            blend(s, batch, blending, [i, p, at], &mut transmittance[p]);
                         let sum = V::load(s, &squares[p][at..]);
                         weight.mul_add(square, sum).store(&mut squares[p][at..]);
                         // Here half of the light is gone.
-                        let crosses = blends.and(half.le(t)).and(next.lt(half));
+                        let crosses = blends.and(half.le(before)).and(after.lt(half));
                         let so_far = V::load(s, &median[p][at..]);
                         crosses.select(depth, so_far).store(&mut median[p][at..]);
-                        let stopped = next.le(min_transmittance).and(seen);
-                        let remaining = stopped.select(zero, blends.select(next, t));
-                        remaining.store(&mut transmittance[p][at..]);
                     }
-                    #[expect(clippy::float_cmp, reason = "finished pixels have exactly 0")]
-                    let all_stopped = transmittance[p] == [0.0; WIDTH];
-                    if all_stopped {
+                    if is_finished(&transmittance[p]) {
                         unfinished &= !(1 << p);
                     }
                 }
@@ -240,7 +228,6 @@ impl WithSimd for Weights<'_> {
     fn with_simd<S: Simd>(self, s: S) {
         let Self { splats, list, place, blending, surface, records, batch } = self;
         let c = |x: f32| V::splat(s, x);
-        let min_transmittance = c(blending.transmittance_min);
         let zero = V::zero(s);
         let (mut transmittance, mut unfinished) = place.inside();
         for (n, chunk) in list.chunks(BATCH).enumerate() {
@@ -253,24 +240,13 @@ impl WithSimd for Weights<'_> {
                     let p = todo.trailing_zeros() as usize % PATCHES;
                     todo &= todo - 1;
                     for at in (0..WIDTH).step_by(S::F32_LANES) {
-                        let [u, z] = batch.u_and_z(s, i, p, at);
-                        let e = u.neg_mul_add(u, z.neg_mul_add(z, c(splat.log2_opacity)));
-                        let seen = c(-blending.log2_reach).le(e);
-                        let alpha = e.exp2().min(c(ALPHA_MAX));
-                        let t = V::load(s, &transmittance[p][at..]);
-                        let next = alpha.neg_mul_add(t, t);
-                        let blends = min_transmittance.lt(next).and(seen);
-                        let weight = blends.keep(alpha * t);
+                        let Blended { weight, .. } =
+                            blend(s, batch, blending, [i, p, at], &mut transmittance[p]);
                         let in_front = c(splat.depth).lt(V::load(s, &surface[p][at..]));
                         sums[0] = sums[0] + in_front.keep(weight);
                         sums[1] = sums[1] + weight;
-                        let stopped = next.le(min_transmittance).and(seen);
-                        let remaining = stopped.select(zero, blends.select(next, t));
-                        remaining.store(&mut transmittance[p][at..]);
                     }
-                    #[expect(clippy::float_cmp, reason = "finished pixels have exactly 0")]
-                    let all_stopped = transmittance[p] == [0.0; WIDTH];
-                    if all_stopped {
+                    if is_finished(&transmittance[p]) {
                         unfinished &= !(1 << p);
                     }
                 }
