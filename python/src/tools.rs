@@ -7,9 +7,10 @@ use densify_core::numbers;
 use densify_data::dataset::builtin;
 use densify_data::models::{compress_formats, find, find_by_extension};
 use densify_report::ReportOptions;
+use densify_run::Host;
 use densify_run::failure::Failure;
 use densify_run::finished::{is_model, model_file};
-use densify_run::{Host, RunConfig};
+use densify_run::refining::TrainedModel;
 use densify_scenegen::{self as generator, Scene, Source};
 use densify_study::{Comparison, SceneBudget};
 use pyo3::exceptions::PyValueError;
@@ -82,31 +83,11 @@ pub(crate) fn compress(
             }
         };
         let file = model_file(&model, iteration)?;
-        let of_run = if is_model(&model) { None } else { Some(RunConfig::read(&model)?) };
-        let scene = given.start.scene.clone();
-        let scene =
-            scene.or_else(|| of_run.as_ref().map(RunConfig::scene_path)).ok_or_else(|| {
-                Failure::input(format!(
-                    "{} is a file, which has no photographs; name its dataset with scene=",
-                    model.display()
-                ))
-            })?;
-        let (data, depth, near, exposure) = match of_run {
-            None => (given.data, given.depth, given.start.near, None),
-            Some(config) => {
-                let model = config.spec.schedule.exposure_model;
-                let exposure = config.resolved.has_exposures.then_some(model);
-                (config.spec.data, config.spec.depth, config.spec.start.near, exposure)
-            }
-        };
+        let of_file = (given.data, given.depth, given.start.near);
+        let trained = TrainedModel::find(&model, file, given.start.scene, of_file, "scene=")?;
         let done = compressing::compress(
             &compressing::Options {
-                model: &file,
-                scene: &scene,
-                data,
-                depth,
-                exposure,
-                near,
+                model: trained,
                 antialias,
                 device: given.device,
                 to,

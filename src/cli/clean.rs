@@ -16,7 +16,8 @@ use densify_core::numbers::{counted, gaussians, grouped, percent};
 use densify_data::models::{Coordinates, find};
 use densify_run::failure::Failure;
 use densify_run::finished::{is_model, model_file, write_model};
-use densify_run::{DepthSpec, Fraction, RunConfig, Whole};
+use densify_run::refining::TrainedModel;
+use densify_run::{DepthSpec, Fraction, Whole};
 use densify_train::evaluate::Split;
 
 /// Removes floaters from a trained model, and writes the rest to another file.
@@ -98,40 +99,26 @@ pub(super) fn run(
         None => format_from_extension(&args.output)?,
     };
     check_output(&args.output, args.overwrite)?;
-    let model = model_file(&args.model, args.iteration)?;
+    let file = model_file(&args.model, args.iteration)?;
     let is_input = |path: &PathBuf| path.canonicalize().ok() == args.output.canonicalize().ok();
-    if args.output.exists() && (is_input(&model) || is_input(&args.model)) {
+    if args.output.exists() && (is_input(&file) || is_input(&args.model)) {
         return Err(Failure::input(format!(
             "-o: {} is the model itself; choose another file",
             args.output.display()
         )));
     }
     let RenderingArgs { near, antialias, device, data } = &args.rendering;
-    let (scene, mut data, depth, near, exposure) = if is_model(&args.model) {
-        let Some(scene) = args.scene.clone() else {
-            return Err(Failure::input(format!(
-                "{} is a file, which has no photographs; name its dataset with --scene DIR",
-                args.model.display()
-            )));
-        };
-        (scene, data.clone(), DepthSpec::default(), *near, None)
+    let mut data = data.clone();
+    if is_model(&args.model) {
+        // Test views are held out as in `densify eval`.
+        data.eval |= data.test_every.is_none();
     } else {
         refuse_scene_options(matches)?;
-        let config = RunConfig::read(&args.model)?;
-        let scene = args.scene.clone().unwrap_or_else(|| config.scene_path());
-        let model = config.spec.schedule.exposure_model;
-        let exposure = config.resolved.has_exposures.then_some(model);
-        (scene, config.spec.data, config.spec.depth, config.spec.start.near, exposure)
-    };
-    // For a file, test views are held out as in `densify eval`.
-    data.eval |= is_model(&args.model) && data.test_every.is_none();
+    }
+    let given = (data, DepthSpec::default(), *near);
+    let model = TrainedModel::find(&args.model, file, args.scene.clone(), given, "--scene DIR")?;
     let options = Options {
-        model: &model,
-        scene: &scene,
-        data,
-        depth,
-        exposure,
-        near,
+        model,
         antialias: *antialias,
         device: device.clone(),
         rules: Rules {

@@ -14,7 +14,8 @@ use densify_core::numbers::{self, grouped, percent};
 use densify_data::models::{Format, compress_formats, find};
 use densify_run::failure::Failure;
 use densify_run::finished::{is_model, model_file};
-use densify_run::{DepthSpec, RunConfig, Whole};
+use densify_run::refining::TrainedModel;
+use densify_run::{DepthSpec, Whole};
 
 /// Reduces a trained model to a number of Gaussians, or to a file size.
 ///
@@ -92,30 +93,14 @@ pub(super) fn run(
         check_output(&file(&args.output, &formats, format), args.overwrite)?;
     }
     let RenderingArgs { near, antialias, device, data } = &args.rendering;
-    let model = model_file(&args.model, args.iteration)?;
-    let (scene, data, depth, near, exposure) = if is_model(&args.model) {
-        let Some(scene) = args.scene.clone() else {
-            return Err(Failure::input(format!(
-                "{} is a file, which has no photographs; name its dataset with --scene DIR",
-                args.model.display()
-            )));
-        };
-        (scene, data.clone(), DepthSpec::default(), *near, None)
-    } else {
+    let file = model_file(&args.model, args.iteration)?;
+    if !is_model(&args.model) {
         refuse_scene_options(matches)?;
-        let config = RunConfig::read(&args.model)?;
-        let scene = args.scene.clone().unwrap_or_else(|| config.scene_path());
-        let model = config.spec.schedule.exposure_model;
-        let exposure = config.resolved.has_exposures.then_some(model);
-        (scene, config.spec.data, config.spec.depth, config.spec.start.near, exposure)
-    };
+    }
+    let given = (data.clone(), DepthSpec::default(), *near);
+    let model = TrainedModel::find(&args.model, file, args.scene.clone(), given, "--scene DIR")?;
     let options = Options {
-        model: &model,
-        scene: &scene,
-        data,
-        depth,
-        exposure,
-        near,
+        model,
         antialias: *antialias,
         device: device.clone(),
         to: args.to,

@@ -5,7 +5,8 @@
 //! handlers. Its caller provides a [`Host`]; progress goes to an [`Observer`]; errors stay data until they are shown.
 //!
 //! Modules from bottom to top, each of which uses only those before it: failure, spec, companion, observer, process,
-//! host, models, coordinate_check, near_plane, position_rates, resolved, finished, session.
+//! host, models, coordinate_check, near_plane, position_rates, resolved, finished, session,
+//! refining.
 
 mod companion;
 pub mod coordinate_check;
@@ -17,6 +18,7 @@ mod near_plane;
 mod observer;
 mod position_rates;
 mod process;
+pub mod refining;
 mod resolved;
 mod session;
 pub mod spec;

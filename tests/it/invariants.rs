@@ -265,6 +265,7 @@ const MODULES: [(&str, &[&str]); 5] = [
             "resolved",
             "finished",
             "session",
+            "refining",
         ],
     ),
 ];

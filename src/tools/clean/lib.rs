@@ -17,28 +17,17 @@ use densify_data::views::ViewSource;
 use densify_run::coordinate_check::CoordinateCheck;
 use densify_run::failure::Failure;
 use densify_run::finished::{Machine, load, near_plane, read_model_as, views_of};
-use densify_run::{DataSpec, DepthSpec, DeviceSpec, Fraction, Observer, check_interrupt};
+use densify_run::refining::TrainedModel;
+use densify_run::{DeviceSpec, Observer, check_interrupt};
 use densify_train::evaluate::Split;
-use densify_train::exposure::{ExposureModel, fitted};
-use densify_train::metrics::psnr;
 
 pub use rules::{Removed, Rule, Rules};
 
 /// Options of [`clean`].
 #[derive(Debug, Clone)]
 pub struct Options<'a> {
-    /// File of the model.
-    pub model: &'a Path,
-    /// Dataset of the model.
-    pub scene: &'a Path,
-    /// Options with which the dataset is read.
-    pub data: DataSpec,
-    /// Depth options of the training.
-    pub depth: DepthSpec,
-    /// Exposure model, if the model was trained with an exposure per photograph.
-    pub exposure: Option<ExposureModel>,
-    /// Near plane, as a fraction of the scene's extent; `None`: the usual near plane of the dataset.
-    pub near: Option<Fraction>,
+    /// The model and its training.
+    pub model: TrainedModel,
     /// Antialiasing of the model; `None`: as its file states.
     pub antialias: Option<Antialiasing>,
     /// Device to measure PSNR and to train on. Weights are measured on the processor.
@@ -75,17 +64,18 @@ pub struct Cleaned {
 /// fails, or the observer interrupts.
 pub fn clean(options: &Options<'_>, observer: &dyn Observer) -> Result<Cleaned, Failure> {
     let machine = Machine::open(&options.device, observer)?;
-    let dataset = load(options.scene, &options.data, observer)?;
-    let near = near_plane(options.near, &dataset, observer);
-    let mut model = read_model_as(options.model, options.antialias, observer)?;
+    let TrainedModel { file, scene, data, near, .. } = &options.model;
+    let dataset = load(scene, data, observer)?;
+    let near = near_plane(*near, &dataset, observer);
+    let mut model = read_model_as(file, options.antialias, observer)?;
     if model.is_empty() {
-        let file = options.model.display();
+        let file = file.display();
         return Err(Failure::input(format!("{file} has no Gaussian; name another model")));
     }
     let split = if dataset.test.is_empty() { Split::Train } else { Split::Test };
     let judge = Judge { dataset: &dataset, machine: &machine, near, split, options, observer };
     let (before, check) = judge.measure(&model)?;
-    check.require(None, options.model, observer)?;
+    check.require(None, file, observer)?;
     let mut stages = vec![(model.len(), before)];
     let mut rounds = Vec::new();
     for _ in 0..options.rounds {
@@ -128,28 +118,20 @@ impl Judge<'_> {
         Ok(self.measure(model)?.0)
     }
 
-    /// Mean PSNR `[dB]`, with the best-fitting exposure of each photograph if exposures are learned, and the comparison
-    /// of coordinates.
+    /// Mean PSNR `[dB]`, and the comparison of coordinates.
     fn measure(&self, model: &Gaussians) -> Result<(f64, CoordinateCheck), Failure> {
-        let background = self.options.data.background.fixed();
-        let mut backend = self.machine.backend(self.dataset, model.clone(), self.near)?;
-        let views = views_of(self.dataset, self.split)?;
-        let mut check = CoordinateCheck::new(views.count());
-        let mut sum = 0.0;
-        for view in 0..views.count() {
-            check_interrupt(self.observer)?;
-            views.prefetch_after(view);
-            let image = views.image(view).map_err(Failure::input)?;
-            let rendering = backend.render(views.camera(view), background, model.sh_degree)?;
-            let score = |rgb: &[f32]| psnr(rgb, &image, background).map_err(Failure::input);
-            // Also checks that the render and the photograph can be compared.
-            let mut value = score(&rendering.rgb)?;
-            if self.options.exposure.is_some() {
-                value = score(&fitted(&rendering.rgb, &image, background))?;
-            }
-            sum += value;
-            check.add(view, &rendering, &image, background);
-        }
-        Ok((sum / views.count() as f64, check))
+        let Self { dataset, split, options, .. } = *self;
+        let background = options.model.data.background.fixed();
+        let mut backend = self.machine.backend(dataset, model.clone(), self.near)?;
+        let mut check = CoordinateCheck::new(views_of(dataset, split)?.count());
+        let psnr = options.model.mean_psnr(
+            backend.as_mut(),
+            (dataset, split),
+            |view, rendering, image| {
+                check.add(view, rendering, image, background);
+                check_interrupt(self.observer)
+            },
+        )?;
+        Ok((psnr, check))
     }
 }

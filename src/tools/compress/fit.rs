@@ -49,12 +49,13 @@ pub(super) fn file_size(format: &Format, model: &Gaussians) -> Result<u64, Failu
 /// Checks that the model can reach the target, before anything is trained.
 pub(super) fn check(options: &Options<'_>, model: &Gaussians) -> Result<(), Failure> {
     match options.to {
-        _ if model.is_empty() => {
-            Err(Failure::input(format!("{}: the model has no Gaussian", options.model.display())))
-        }
+        _ if model.is_empty() => Err(Failure::input(format!(
+            "{}: the model has no Gaussian",
+            options.model.file.display()
+        ))),
         Target::Rows(rows) if rows > model.len() => Err(Failure::input(format!(
             "--to {rows}: {} has only {} Gaussians; give fewer, or a size such as 5MiB",
-            options.model.display(),
+            options.model.file.display(),
             grouped(model.len())
         ))),
         Target::Bytes(limit) if limit < smallest_size(options, model).0 => {

@@ -16,14 +16,14 @@ use std::path::{Path, PathBuf};
 use tempfile::TempPath;
 
 use densify_core::antialiasing::Antialiasing;
-use densify_core::files::{FileError, folder_of, write_atomically};
+use densify_core::files::write_atomically;
 use densify_core::gaussians::Gaussians;
 use densify_core::numbers::{gaussians, grouped};
 use densify_data::models::{Coarseness, Format, Frame, PLY, local_origin, offset_text};
 use densify_run::failure::Failure;
 use densify_run::finished::{read_model, read_model_as, say_unstated};
-use densify_run::{DataSpec, DepthSpec, DeviceSpec, Fraction, Observer, Silent};
-use densify_train::exposure::ExposureModel;
+use densify_run::refining::{TrainedModel, scratch_beside};
+use densify_run::{DeviceSpec, Observer, Silent};
 use evaluator::Evaluator;
 use fit::Packing;
 
@@ -39,18 +39,8 @@ pub enum Target {
 /// Options of [`compress`].
 #[derive(Debug, Clone)]
 pub struct Options<'a> {
-    /// File of the model.
-    pub model: &'a Path,
-    /// Dataset of the model.
-    pub scene: &'a Path,
-    /// Options with which the dataset is read.
-    pub data: DataSpec,
-    /// Depth options of the training.
-    pub depth: DepthSpec,
-    /// Exposure model, if the model was trained with an exposure per photograph.
-    pub exposure: Option<ExposureModel>,
-    /// Near plane, as a fraction of the scene's extent; `None`: the usual near plane of the dataset.
-    pub near: Option<Fraction>,
+    /// The model and its training.
+    pub model: TrainedModel,
     /// Antialiasing of the model; `None`: as its file states.
     pub antialias: Option<Antialiasing>,
     /// Device to compute on.
@@ -115,16 +105,17 @@ pub struct Compressed {
 /// then.
 pub fn compress(options: &Options<'_>, observer: &dyn Observer) -> Result<Compressed, Failure> {
     let evaluator = Evaluator::open(options, observer)?;
-    if options.exposure.is_some() {
+    if options.model.exposure.is_some() {
         observer.say(format_args!(
             "exposure learned again, as in the run; PSNR is measured with the best exposure of each photograph"
         ));
     }
-    let model = in_fine_coordinates(read_model_as(options.model, options.antialias, observer)?);
+    let original = read_model_as(&options.model.file, options.antialias, observer)?;
+    let model = in_fine_coordinates(original);
     fit::check(options, &model)?;
     let bytes = fit::file_size(PLY, &model)?;
-    let whole = evaluator.evaluate_original(model.clone(), options.model, bytes, observer)?;
-    let scratch = create_scratch_file(options.output)?;
+    let whole = evaluator.evaluate_original(model.clone(), bytes, observer)?;
+    let scratch = scratch_beside(options.output)?;
     let allowed_formats = options.formats;
     let formats = fit::usable_formats(options, &model, &scratch, observer)?;
     let options = &Options { formats: &formats, ..options.clone() };
@@ -241,14 +232,6 @@ fn in_fine_coordinates(model: Gaussians) -> Gaussians {
     let is_coarse = Coarseness::measure(&model).is_noted();
     let origin = if is_coarse { local_origin(&model) } else { [0.0; 3] };
     model.with_origin(origin)
-}
-
-/// Creates a temporary file in the folder of the result.
-fn create_scratch_file(output: &Path) -> Result<TempPath, Failure> {
-    let folder = folder_of(output);
-    let made = std::fs::create_dir_all(folder)
-        .and_then(|()| tempfile::NamedTempFile::with_prefix_in(".densify-", folder));
-    Ok(made.map_err(FileError::io("write to the folder", folder))?.into_temp_path())
 }
 
 /// Spherical-harmonic degrees to try, the model's own first.

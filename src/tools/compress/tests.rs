@@ -7,7 +7,8 @@ use densify_core::gaussians::sh_coefficients;
 use densify_data::dataset::DepthChoice;
 use densify_fixtures::Made;
 use densify_render::BackendChoice;
-use densify_run::Silent;
+use densify_run::refining::Refinement;
+use densify_run::{DataSpec, DepthSpec, Silent};
 
 #[test]
 fn degrees_are_tried_downwards_from_that_of_the_model() {
@@ -36,14 +37,16 @@ fn sog() -> &'static Format {
     densify_data::models::find("sog").expect("a format")
 }
 
-fn options<'a>(to: Target, scene: &'a Path, formats: &'a [&'static Format]) -> Options<'a> {
+fn options<'a>(to: Target, scene: &Path, formats: &'a [&'static Format]) -> Options<'a> {
     Options {
-        model: Path::new("model.ply"),
-        scene,
-        data: DataSpec::default(),
-        depth: DepthSpec::default(),
-        exposure: None,
-        near: None,
+        model: TrainedModel {
+            file: "model.ply".into(),
+            scene: scene.to_owned(),
+            data: DataSpec::default(),
+            depth: DepthSpec::default(),
+            exposure: None,
+            near: None,
+        },
         antialias: None,
         device: DeviceSpec { backend: BackendChoice::Cpu, ..DeviceSpec::default() },
         to,
@@ -125,7 +128,7 @@ fn colours_stay_as_decoded_from_the_file() {
     let formats = [sog()];
     let options = options(Target::Rows(256), made.path(), &formats);
     let variant = &sog().variants()[2];
-    let scratch = create_scratch_file(&made.path().join("small.sog")).expect("a file");
+    let scratch = scratch_beside(&made.path().join("small.sog")).expect("a file");
     let start = colourful(256);
     let tuned =
         tune::tune(start.clone(), (variant, 256), &options, &scratch, &Silent, &mut |_| Ok(()));
@@ -144,8 +147,10 @@ fn colours_stay_as_decoded_from_the_file() {
 fn training_has_the_depth_options_of_the_run() {
     let depth = DepthSpec { depth: Some(DepthChoice::Off), ..DepthSpec::default() };
     let formats = [sog()];
-    let options =
-        Options { depth: depth.clone(), ..options(Target::Rows(3), Path::new(""), &formats) };
-    let spec = tune::describe_run(&colourful(3), (3, 5), &options, Path::new("scratch.ply"));
+    let Options { model, device, .. } = options(Target::Rows(3), Path::new(""), &formats);
+    let model = TrainedModel { depth: depth.clone(), ..model };
+    let refinement =
+        Refinement { device: &device, rows: 3, iterations: 5, seed: 0, freezes_bands: false };
+    let spec = model.describe_training(&colourful(3), &refinement, Path::new("scratch.ply"));
     assert_eq!(spec.expect("described").depth, depth);
 }

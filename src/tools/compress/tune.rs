@@ -7,18 +7,11 @@ use super::{Options, Target, fit};
 use densify_core::files::write_atomically;
 use densify_core::gaussians::Gaussians;
 use densify_core::numbers::gaussians;
-use densify_data::models::{Coordinates, Format, PLY};
+use densify_data::models::Format;
 use densify_run::failure::Failure;
 use densify_run::finished::read_model;
-use densify_run::{
-    AbsolutePath, Assignment, Budget, InitChoice, Observer, Run, RunSpec, ShDegree, Silent, Whole,
-};
-use densify_train::exposure::ExposureChoice;
-
-/// With the settings below, this policy neither adds nor prunes rows.
-const POLICY: &str = "vanilla";
-const POLICY_SETTINGS: [&str; 3] =
-    ["vanilla.grow_every=0", "vanilla.reset_every=0", "vanilla.white_reset_at=0"];
+use densify_run::refining::Refinement;
+use densify_run::{Observer, Silent};
 
 /// Prunes the model to about its `rows` most important rows, and trains them. Training changes the compression ratio,
 /// so the number of rows that fit is estimated again before the last stage. If the format is lossy, the second half of
@@ -54,45 +47,30 @@ pub(super) fn tune(
         ));
         let is_last = stage + 1 == stages.len();
         let adaptation_steps = if format.is_lossy() && is_last { iterations / 2 } else { 0 };
-        let setting = (budget, iterations - adaptation_steps);
-        model = train(model, setting, false, options, scratch, observer)?;
+        let refinement = Refinement {
+            device: &options.device,
+            rows: budget,
+            iterations: iterations - adaptation_steps,
+            seed: options.seed,
+            freezes_bands: false,
+        };
+        model = options.model.train(model, &refinement, scratch, observer)?;
         if adaptation_steps > 0 {
             model = reduce(model, u8::MAX); // Keeps the degree.
             write_atomically(scratch, |out| format.write(&model, out))?;
             let origin = model.origin;
             // The temporary file has no sidecar.
             model = Gaussians { origin, ..read_model(scratch, &Silent)? };
-            let setting = (model.len(), adaptation_steps);
-            model = train(model, setting, true, options, scratch, observer)?;
+            let refinement = Refinement {
+                rows: model.len(),
+                iterations: adaptation_steps,
+                freezes_bands: true,
+                ..refinement
+            };
+            model = options.model.train(model, &refinement, scratch, observer)?;
         }
     }
     Ok(model)
-}
-
-/// Trains the model with a budget and a number of iterations.
-fn train(
-    model: Gaussians,
-    setting: (usize, u32),
-    freezes_sh: bool,
-    options: &Options<'_>,
-    scratch: &Path,
-    observer: &dyn Observer,
-) -> Result<Gaussians, Failure> {
-    write_atomically(scratch, |out| PLY.write(&model, out))?;
-    let mut spec = describe_run(&model, setting, options, scratch)?;
-    if freezes_sh {
-        spec.schedule.lr = vec![assignment("sh_rest=0")?];
-    }
-    let origin = model.origin;
-    spec.output.coordinates =
-        if model.is_local() { Coordinates::Local } else { Coordinates::World };
-    drop(model);
-    let tuned = Run::prepare(&spec)?.model_after_training(observer)?;
-    Ok(tuned.with_origin(origin))
-}
-
-fn assignment(text: &str) -> Result<Assignment, Failure> {
-    text.parse().map_err(Failure::input)
 }
 
 /// The budget and the iterations of each stage. There are at least `least_stages` stages, each budget is at least half
@@ -108,34 +86,6 @@ fn stages((whole, rows): (usize, usize), iterations: u32, least_stages: u32) -> 
         ((whole as f64 / ratio.powf(f64::from(number) / f64::from(count))) as usize, share)
     };
     (1..=count).map(stage).filter(|(_, steps)| *steps > 0).collect()
-}
-
-/// Describes the run of a stage.
-pub(super) fn describe_run(
-    model: &Gaussians,
-    (budget, iterations): (usize, u32),
-    options: &Options<'_>,
-    scratch: &Path,
-) -> Result<RunSpec, Failure> {
-    let mut spec =
-        RunSpec { data: options.data.clone(), depth: options.depth.clone(), ..RunSpec::default() };
-    spec.device = options.device.clone();
-    spec.start.scene = Some(options.scene.to_owned());
-    let file = std::path::absolute(scratch).map_err(Failure::input)?;
-    spec.start.init = Some(InitChoice::Model(AbsolutePath(file)));
-    spec.start.near = options.near;
-    spec.size.budget = Some(Budget::Rows(budget));
-    spec.size.sh_degree = Some(ShDegree::Fixed(model.sh_degree));
-    POLICY.clone_into(&mut spec.density.policy);
-    spec.density.policy_set =
-        POLICY_SETTINGS.into_iter().map(assignment).collect::<Result<_, _>>()?;
-    spec.schedule.iterations = Whole(iterations);
-    spec.schedule.seed = options.seed;
-    if let Some(exposure_model) = options.exposure {
-        spec.schedule.exposure = ExposureChoice::On;
-        spec.schedule.exposure_model = exposure_model;
-    }
-    Ok(spec)
 }
 
 #[cfg(test)]

@@ -7,6 +7,7 @@ use densify::clean::{Options, Rules, clean};
 use densify::core::gaussians::{Gaussians, logit, rgb_to_dc};
 use densify::data::models::PLY;
 use densify::render::BackendChoice;
+use densify::run::refining::TrainedModel;
 use densify::run::{DataSpec, DepthSpec, DeviceSpec, Interrupt, Observer};
 
 use super::{call, gaussians, read, read_text, scratch, text, train};
@@ -158,12 +159,14 @@ fn a_signal_stops_between_any_two_views() {
     let model = run.join("point_cloud/iteration_20/point_cloud.ply");
     let output = root.path().join("a.ply");
     let options = Options {
-        model: &model,
-        scene: scene.path(),
-        data: DataSpec { eval: true, ..DataSpec::default() },
-        depth: DepthSpec::default(),
-        exposure: None,
-        near: None,
+        model: TrainedModel {
+            file: model,
+            scene: scene.path().to_owned(),
+            data: DataSpec { eval: true, ..DataSpec::default() },
+            depth: DepthSpec::default(),
+            exposure: None,
+            near: None,
+        },
         antialias: None,
         device: DeviceSpec { backend: BackendChoice::Cpu, ..DeviceSpec::default() },
         rules: Rules { keep_box: None, unseen: true, in_front: true, margin: 0.05, isolated: 0.0 },
