@@ -96,28 +96,6 @@ fn sum_before(lane: u32, value: u32) -> u32 {
     return before;
 }
 
-// Replaces eight numbers of each invocation, from `first` on, by their prefix sums, which start at `carry`; of all
-// numbers, those below `end` count.
-// The total is then in partial[255].
-fn scan(lane: u32, first: u32, end: u32, carry: u32) {
-    // Initialised explicitly: naga does not reset a variable in each round of a loop.
-    var values = array<u32, 8>();
-    var sum = 0u;
-    for (var k = 0u; k < EACH; k++) {
-        if first + k < end {
-            values[k] = sums[first + k];
-        }
-        sum = saturating(sum, values[k]);
-    }
-    var before = saturating(carry, sum_before(lane, sum));
-    for (var k = 0u; k < EACH; k++) {
-        if first + k < end {
-            sums[first + k] = before;
-        }
-        before = saturating(before, values[k]);
-    }
-}
-
 // Prefix sums of the entries of each row, by blocks.
 @compute @workgroup_size(256)
 fn scan_blocks(
@@ -125,8 +103,22 @@ fn scan_blocks(
     @builtin(local_invocation_index) lane: u32,
 ) {
     let block = group_of(id);
-    let first = block * BLOCK;
-    scan(lane, first + lane * EACH, state.visible, 0u);
+    let first = block * BLOCK + lane * EACH;
+    var values = array<u32, 8>();
+    var sum = 0u;
+    for (var k = 0u; k < EACH; k++) {
+        if first + k < state.visible {
+            values[k] = sums[first + k];
+        }
+        sum = saturating(sum, values[k]);
+    }
+    var before = sum_before(lane, sum);
+    for (var k = 0u; k < EACH; k++) {
+        if first + k < state.visible {
+            sums[first + k] = before;
+        }
+        before = saturating(before, values[k]);
+    }
     if lane == 0u && first < state.visible {
         block_sums[block] = partial[255];
     }
@@ -424,22 +416,44 @@ fn count_digits(
     }
 }
 
-// Prefix sums of a digit's counts over the blocks, and its total; one group per digit.
+// Invocations per digit in scan_digits; a group has eight digits.
+const SCANNERS: u32 = 32u;
+
+// Prefix sums of a digit's counts over the blocks, and its total. An invocation has a run of neighbouring blocks.
 @compute @workgroup_size(256)
 fn scan_digits(
     @builtin(workgroup_id) id: vec3<u32>,
     @builtin(local_invocation_index) lane: u32,
 ) {
     let blocks = ceil_div(items(), SORTED);
-    let from_block = id.x * blocks;
-    var total = 0u;
-    for (var start = 0u; start < blocks; start += BLOCK) {
-        scan(lane, from_block + start + lane * EACH, from_block + blocks, total);
-        total += partial[255];
+    let digit = id.x * (GROUP / SCANNERS) + lane / SCANNERS;
+    let scanner = lane % SCANNERS;
+    let each = ceil_div(blocks, SCANNERS);
+    let first = digit * blocks + min(scanner * each, blocks);
+    let end = digit * blocks + min((scanner + 1u) * each, blocks);
+    var sum = 0u;
+    for (var i = first; i < end; i++) {
+        sum += sums[i];
+    }
+    partial[lane] = sum;
+    workgroupBarrier();
+    for (var step = 1u; step < SCANNERS; step *= 2u) {
+        var until = partial[lane];
+        if scanner >= step {
+            until += partial[lane - step];
+        }
+        workgroupBarrier();
+        partial[lane] = until;
         workgroupBarrier();
     }
-    if lane == 0u {
-        block_sums[id.x] = total;
+    var before = partial[lane] - sum;
+    for (var i = first; i < end; i++) {
+        let count = sums[i];
+        sums[i] = before;
+        before += count;
+    }
+    if scanner == SCANNERS - 1u {
+        block_sums[digit] = before;
     }
 }
 

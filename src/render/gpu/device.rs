@@ -10,7 +10,7 @@ use wgpu::{DeviceDescriptor, ErrorFilter, Features, MemoryHints};
 
 use super::adapter::{choose, enumerate, features_for};
 use super::clock::{self, Clock};
-use super::pipelines::{Pipelines, Variant};
+use super::pipelines::{KernelCache, Pipelines, Variant};
 use super::sizes::{ALLOCATOR_BLOCK, UPLOAD_BYTES};
 use super::{GpuBackend, memory_plan};
 use crate::signals::RecordLayout;
@@ -99,8 +99,7 @@ pub(super) struct Device {
     reported: Arc<Mutex<ReportedErrors>>,
     /// Bytes written to the queue since the last wait, for which wgpu holds copies.
     written: Mutex<u64>,
-    /// The compiled variants.
-    pipelines: Mutex<Vec<(Variant, Arc<Pipelines>)>>,
+    kernels: Mutex<KernelCache>,
     /// The record layouts and kinds of storage for which the device has passed the canary.
     passed: Mutex<Vec<(RecordLayout, Storage)>>,
 }
@@ -143,21 +142,20 @@ impl Device {
             accumulation,
             reported,
             written: Mutex::default(),
-            pipelines: Mutex::default(),
+            kernels: Mutex::default(),
             passed: Mutex::default(),
         })
     }
 
     /// The kernels of a variant, compiled on first use.
     pub(super) fn pipelines(&self, variant: Variant) -> Result<Arc<Pipelines>, BackendError> {
-        let mut all = self.pipelines.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some((_, pipelines)) = all.iter().find(|(known, _)| *known == variant) {
-            return Ok(pipelines.clone());
+        let mut cache = self.kernels.lock().unwrap_or_else(PoisonError::into_inner);
+        let compiled = self.guarded("the kernels", 0, |device| cache.pipelines(device, variant));
+        if compiled.is_err() {
+            // Some of the new kernels may be invalid.
+            *cache = KernelCache::default();
         }
-        let compiled = self.guarded("the kernels", 0, |device| Pipelines::new(device, variant))?;
-        let compiled = Arc::new(compiled);
-        all.push((variant, compiled.clone()));
-        Ok(compiled)
+        compiled
     }
 
     /// Runs `check` unless the device has already passed it for these kernels.

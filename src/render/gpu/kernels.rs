@@ -3,8 +3,11 @@
 //! Bindings are declared only in the WGSL. A variable is bound to the buffer of the same name (`row_of_slot`:
 //! "row of slot"), unless `rebound` in `launches.rs` names another.
 
+use std::collections::BTreeSet;
+
 use densify_shaders::Stage;
 use wgpu::naga::Module;
+use wgpu::naga::compact::{KeepUnused, compact};
 use wgpu::naga::front::wgsl;
 use wgpu::naga::valid::{Capabilities, ModuleInfo, ValidationFlags, Validator};
 
@@ -24,7 +27,11 @@ pub(super) fn kernels(stage: &Stage, text: &str, module: &Module) -> Vec<Kernel>
         .unwrap_or_else(|e| panic!("{}: {}", stage.name, e.emit_to_string(text)));
     let entries = module.entry_points.iter().enumerate();
     entries
-        .map(|(i, e)| Kernel { entry: e.name.clone(), bindings: bindings(module, &info, i) })
+        .map(|(i, e)| Kernel {
+            entry: e.name.clone(),
+            bindings: bindings(module, &info, i),
+            overrides: overrides(module, i),
+        })
         .collect()
 }
 
@@ -33,6 +40,8 @@ pub(super) fn kernels(stage: &Stage, text: &str, module: &Module) -> Vec<Kernel>
 pub(super) struct Kernel {
     pub(super) entry: String,
     pub(super) bindings: Vec<Binding>,
+    /// Names of the `override` constants that it uses.
+    pub(super) overrides: BTreeSet<String>,
 }
 
 /// A buffer that a kernel uses: its binding number, and the variable's name with spaces for underscores.
@@ -50,6 +59,14 @@ fn bindings(module: &Module, info: &ModuleInfo, entry: usize) -> Vec<Binding> {
         Some(Binding { number: variable.binding.as_ref()?.binding, name })
     })
     .collect()
+}
+
+/// The names of the `override` constants that an entry point uses: those of the module without the other entry points.
+fn overrides(module: &Module, entry: usize) -> BTreeSet<String> {
+    let mut alone = module.clone();
+    alone.entry_points = vec![module.entry_points[entry].clone()];
+    compact(&mut alone, KeepUnused::No);
+    alone.overrides.iter().filter_map(|(_, constant)| constant.name.clone()).collect()
 }
 
 #[cfg(test)]

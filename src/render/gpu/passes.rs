@@ -28,8 +28,8 @@ const ROWS: u32 = 1;
 const ENTRIES: u32 = 2;
 /// Number of eight-bit digits of a depth.
 const DEPTH_DIGITS: u32 = 4;
-/// Number of values of a digit.
-const DIGITS: u32 = 256;
+/// Number of workgroups of `scan_digits`: one per eight values of a digit.
+const DIGIT_GROUPS: u32 = 256 / 8;
 /// The launch of `scatter` that writes the order of rows.
 const TO_ORDER: usize = 4;
 /// Band number that stands for the whole image.
@@ -152,7 +152,7 @@ impl<L> Passes<'_, L> {
         } else {
             to.run(count, immediates, blocks);
         }
-        to.run(l.get("scan_digits"), immediates, DIGITS);
+        to.run(l.get("scan_digits"), immediates, DIGIT_GROUPS);
         if items == ENTRIES {
             to.run_counted(scatter, immediates, args::ENTRIES);
         } else {

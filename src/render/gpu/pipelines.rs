@@ -1,15 +1,16 @@
 //! Compiles the compute pipelines of a device. wgpu derives their layouts from the shaders.
 
 use std::collections::HashMap;
+use std::sync::Arc;
 
 use densify_policies::policy::{SUPPORT_WEIGHT, Signal};
 use wgpu::{ComputePipeline, Device, ShaderModule};
 
-use super::kernels::{Binding, kernels, parse};
+use super::kernels::{Binding, Kernel, kernels, parse};
 use crate::Shortcuts;
 use crate::signals::{Field, ParameterSignal, RecordLayout};
 use densify_core::antialiasing::Antialiasing;
-use densify_shaders::{Formats, STAGES};
+use densify_shaders::{Formats, STAGES, Stage};
 
 /// Compile-time options of the kernels.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -65,41 +66,92 @@ fn constant(signal: Signal) -> String {
 /// A compiled kernel and its bindings.
 #[derive(Debug)]
 pub(super) struct CompiledKernel {
+    entry: String,
+    /// Values of the constants that it uses.
+    constants: Vec<(String, f64)>,
     pub(super) pipeline: ComputePipeline,
     pub(super) bindings: Vec<Binding>,
 }
 
-/// The kernels of a device, by name.
+/// The kernels that a device has compiled. Variants share the kernels whose text and constants are equal.
+#[derive(Debug, Default)]
+pub(super) struct KernelCache {
+    variants: Vec<(Variant, Arc<Pipelines>)>,
+    /// By the text of the stage.
+    stages: HashMap<String, CachedStage>,
+}
+
+impl KernelCache {
+    /// The kernels of a variant; compiles those that are new.
+    pub(super) fn pipelines(&mut self, device: &Device, variant: Variant) -> Arc<Pipelines> {
+        if let Some((_, pipelines)) = self.variants.iter().find(|(known, _)| *known == variant) {
+            return pipelines.clone();
+        }
+        let mut kernels = HashMap::new();
+        let values = variant.constants();
+        for stage in STAGES {
+            let Some(text) = stage.text(variant.formats) else { continue };
+            let new = || CachedStage::new(device, stage, &text);
+            let cached = self.stages.entry(text.clone()).or_insert_with(new);
+            kernels.extend(cached.compiled(device, &values));
+        }
+        let pipelines = Arc::new(Pipelines { kernels });
+        self.variants.push((variant, pipelines.clone()));
+        pipelines
+    }
+}
+
+/// The kernels of a text.
+#[derive(Debug)]
+struct CachedStage {
+    kernels: Vec<Kernel>,
+    module: ShaderModule,
+    compiled: Vec<Arc<CompiledKernel>>,
+}
+
+impl CachedStage {
+    fn new(device: &Device, stage: &Stage, text: &str) -> Self {
+        let module = device.create_shader_module(wgpu::ShaderModuleDescriptor {
+            label: Some(stage.name),
+            source: wgpu::ShaderSource::Wgsl(text.into()),
+        });
+        let kernels = kernels(stage, text, &parse(stage, text));
+        Self { kernels, module, compiled: Vec::new() }
+    }
+
+    /// The kernels with the values of all constants.
+    fn compiled<'a>(
+        &'a mut self,
+        device: &'a Device,
+        values: &'a [(String, f64)],
+    ) -> impl Iterator<Item = (String, Arc<CompiledKernel>)> + 'a {
+        let Self { kernels, module, compiled } = self;
+        kernels.iter().map(move |kernel| {
+            let is_used = |name: &String| kernel.overrides.contains(name);
+            let constants = values.iter().filter(|(name, _)| is_used(name)).cloned();
+            let constants: Vec<_> = constants.collect();
+            let is_same = |known: &&Arc<CompiledKernel>| {
+                known.entry == kernel.entry && known.constants == constants
+            };
+            let found = compiled.iter().find(is_same).cloned().unwrap_or_else(|| {
+                let pipeline = compile(device, module, &kernel.entry, &constants);
+                let (entry, bindings) = (kernel.entry.clone(), kernel.bindings.clone());
+                let new = Arc::new(CompiledKernel { entry, constants, pipeline, bindings });
+                compiled.push(new.clone());
+                new
+            });
+            (kernel.entry.clone(), found)
+        })
+    }
+}
+
+/// The kernels of a variant, by name.
 #[derive(Debug)]
 pub(super) struct Pipelines {
-    kernels: HashMap<String, CompiledKernel>,
+    kernels: HashMap<String, Arc<CompiledKernel>>,
 }
 
 impl Pipelines {
-    /// Compiles every kernel of the variant.
-    pub(super) fn new(device: &Device, variant: Variant) -> Self {
-        let mut compiled = HashMap::new();
-        for stage in STAGES {
-            let Some(text) = stage.text(variant.formats) else { continue };
-            let parsed = parse(stage, &text);
-            let module = device.create_shader_module(wgpu::ShaderModuleDescriptor {
-                label: Some(stage.name),
-                source: wgpu::ShaderSource::Wgsl((&text).into()),
-            });
-            let is_declared =
-                |name: &str| parsed.overrides.iter().any(|(_, o)| o.name.as_deref() == Some(name));
-            let constants = variant.constants();
-            let declared = constants.iter().filter(|(name, _)| is_declared(name));
-            let constants: Vec<_> = declared.map(|(name, value)| (&**name, *value)).collect();
-            for kernel in kernels(stage, &text, &parsed) {
-                let pipeline = compile(device, &module, &kernel.entry, &constants);
-                let compiled_kernel = CompiledKernel { pipeline, bindings: kernel.bindings };
-                compiled.insert(kernel.entry, compiled_kernel);
-            }
-        }
-        Self { kernels: compiled }
-    }
-
     pub(super) fn names(&self) -> impl Iterator<Item = &str> {
         self.kernels.keys().map(String::as_str)
     }
@@ -116,15 +168,16 @@ fn compile(
     device: &Device,
     module: &ShaderModule,
     entry: &str,
-    constants: &[(&str, f64)],
+    constants: &[(String, f64)],
 ) -> ComputePipeline {
+    let constants: Vec<_> = constants.iter().map(|(name, value)| (&**name, *value)).collect();
     device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
         label: Some(entry),
         layout: None,
         module,
         entry_point: Some(entry),
         compilation_options: wgpu::PipelineCompilationOptions {
-            constants,
+            constants: &constants,
             // Every kernel writes shared memory before it reads it.
             zero_initialize_workgroup_memory: false,
         },

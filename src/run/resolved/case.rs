@@ -134,10 +134,15 @@ impl<'a> Case<'a> {
     ) -> Result<Self, Failure> {
         let has_exposures = spec.schedule.exposure != ExposureChoice::Off;
         let reading = Reading { models: Some(models), tracks: has_exposures, ..Reading::default() };
-        Self::open(spec, &reading, host, |evidence| {
+        let mut case = Self::open(spec, &reading, host, |evidence| {
             let exposure = Exposure::known(has_exposures, super::ExposureSource::Given);
             (Degree::decide(spec, None, evidence), exposure)
-        })
+        })?;
+        if case.inputs.device.adapter().is_none() {
+            // The run will be another process, so what this one holds counts only if it includes a driver's kernels.
+            case.inputs.to_mut().resident = None;
+        }
+        Ok(case)
     }
 
     fn open(

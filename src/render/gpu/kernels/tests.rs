@@ -166,13 +166,32 @@ fn every_kernel_is_dispatched_by_its_name() {
     assert_eq!(dispatched, found_kernels);
 }
 
+/// A kernel is compiled again where one of its constants changes, and only there.
+#[test]
+fn kernels_have_exactly_the_constants_that_they_use() {
+    let (mut declared, mut used) = (BTreeSet::new(), BTreeSet::new());
+    let mut of_kernel = BTreeMap::new();
+    for (stage, text, module) in modules(SLOTS) {
+        let names = module.overrides.iter().filter_map(|(_, constant)| constant.name.clone());
+        declared.extend(names);
+        for Kernel { entry, overrides, .. } in kernels(stage, &text, &module) {
+            used.extend(overrides.iter().cloned());
+            of_kernel.insert(entry, overrides);
+        }
+    }
+    assert_eq!(used, declared);
+    assert!(of_kernel["similarity"].is_empty());
+    assert!(of_kernel["rasterize_bwd"].contains("RECORD"));
+    assert!(!of_kernel["rasterize"].contains("RECORD"));
+}
+
 /// A variable without a buffer would be bound to the placeholder.
 #[test]
 fn every_variable_has_a_buffer() {
     for formats in Formats::all() {
         let mut found_kernels = BTreeMap::new();
         for (stage, text, module) in modules(formats) {
-            for Kernel { entry, bindings } in kernels(stage, &text, &module) {
+            for Kernel { entry, bindings, .. } in kernels(stage, &text, &module) {
                 assert!(
                     found_kernels.insert(entry.clone(), bindings).is_none(),
                     "two kernels `{entry}`"

@@ -50,9 +50,9 @@ pub struct DepthErrors {
     /// Mean of |error| / depth.
     #[serde(deserialize_with = "or_nan")]
     pub abs_rel: f64,
-    /// Root mean square distance, weighted by w, between the camera z of the rows' centres and the rendered depth at
-    /// their pixels, over all training views `[diagonals]`: how far the rows that make up a pixel are spread along its
-    /// ray.
+    /// Root mean square distance between the camera z of the rows' centres and the rendered depth at their pixels,
+    /// weighted by the rows' blend weights in the view `[diagonals]`: how far the rows that make up a pixel are spread
+    /// along its ray.
     #[serde(default = "nan", deserialize_with = "or_nan")]
     pub spread: f64,
     /// Fraction of the pixels showing a surface that have a rendered alpha above 0.5.

@@ -38,7 +38,7 @@ pub fn measure(
         pixels.add(backend, views, view)?;
     }
     Ok(Geometry {
-        depth: DepthErrors { spread: visibility.spread(scene.diagonal()), ..pixels.depth() },
+        depth: pixels.depth(),
         normal_error: pixels.normal_error(),
         centres: centres::errors(&rows, &visibility, scene)?,
         floaters: visibility.floaters(&rows, scene.diagonal()),

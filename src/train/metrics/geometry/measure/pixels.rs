@@ -6,6 +6,7 @@ use glam::{DVec2, DVec3, Vec3};
 use rayon::prelude::*;
 
 use super::rows::{Rows, SolidRows};
+use super::visibility::{Shown, shown, weights};
 use super::{DepthErrors, KnownScene, ThinRecall, ratio};
 use crate::metrics::EvaluateError;
 use densify_core::image::Image8;
@@ -30,6 +31,8 @@ pub(super) struct Pixels<'a> {
     covered_pixels: usize,
     squared_errors: f64,
     relative_errors: f64,
+    /// Sum of w·(z − depth)² `[world units²]`, and of the weights w.
+    spread: (f64, f64),
     /// Angles between normals `[degrees]`.
     angles: Vec<f64>,
     /// Numbers of all pixels and of found pixels, by the rounded base-2 logarithm of the structure's width `[px]`.
@@ -46,6 +49,7 @@ impl<'a> Pixels<'a> {
             covered_pixels: 0,
             squared_errors: 0.0,
             relative_errors: 0.0,
+            spread: (0.0, 0.0),
             angles: Vec::new(),
             thin: BTreeMap::new(),
         })
@@ -60,11 +64,19 @@ impl<'a> Pixels<'a> {
     ) -> Result<(), EvaluateError> {
         let scene = self.scene;
         let name = views.name(view);
-        let (_, ray_camera) = scene.cameras(views.camera(view));
+        let camera = views.camera(view);
+        let (world, ray_camera) = scene.cameras(camera);
         let g_buffer = scene.g_buffer(name, &ray_camera)?;
-        let rendering = backend
-            .render(views.camera(view), scene.background, scene.sh_degree)
-            .map_err(|source| EvaluateError::Backend { view: name.to_owned(), source })?;
+        let failed = |source| EvaluateError::Backend { view: name.to_owned(), source };
+        let weights = weights(backend, scene, camera).map_err(failed)?;
+        let rendering =
+            backend.render(camera, scene.background, scene.sh_degree).map_err(failed)?;
+        for Shown { weight, depth, pixel } in shown(self.rows, &weights, &world) {
+            if let Some(rendered) = depth_at(&rendering, pixel, scene.normalisation.scale) {
+                self.spread.0 += weight * (depth - rendered) * (depth - rendered);
+                self.spread.1 += weight;
+            }
+        }
         let width = g_buffer.width as usize;
         let at = |i: usize| DVec2::new((i % width) as f64, (i / width) as f64) + 0.5;
         let shown: Vec<usize> =
@@ -124,8 +136,7 @@ impl<'a> Pixels<'a> {
             rmse: ratio(self.squared_errors, covered).sqrt() / self.scene.diagonal(),
             abs_rel: ratio(self.relative_errors, covered),
             coverage: ratio(covered, self.surface_pixels as f64),
-            // This is measured in the training views.
-            spread: f64::NAN,
+            spread: ratio(self.spread.0, self.spread.1).sqrt() / self.scene.diagonal(),
         }
     }
 

@@ -7,14 +7,13 @@ use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng, SeedableRng};
 use rayon::prelude::*;
 
-use super::pixels::depth_at;
 use super::rows::Rows;
 use super::{Floaters, KnownScene, Redundancy, needs, ratio};
 use crate::metrics::EvaluateError;
 use densify_core::camera::Camera;
 use densify_core::image::Image8;
 use densify_data::views::ViewSource;
-use densify_render::{AuxInput, Backend};
+use densify_render::{AuxInput, Backend, BackendError};
 
 /// Number of samples on the mesh.
 const SAMPLES: usize = 20_000;
@@ -42,8 +41,6 @@ pub(super) struct Visibility {
     blended: (f64, f64),
     /// Weight of rows before the surface, and of all rows.
     before: (f64, f64),
-    /// Sum of w·(z − depth)² `[world units²]`, and of the weights w.
-    squares: (f64, f64),
     /// Samples of the mesh that are visible in enough views.
     pub(super) samples: Vec<DVec3>,
 }
@@ -63,7 +60,6 @@ impl Visibility {
             seen_through: vec![0; rows.len()],
             blended: (0.0, 0.0),
             before: (0.0, 0.0),
-            squares: (0.0, 0.0),
             samples: Vec::new(),
         };
         let request = needs().aux.unwrap_or_default();
@@ -73,13 +69,9 @@ impl Visibility {
             let camera = views.camera(number);
             let weights = visibility.add_weights(backend, scene, camera, &request);
             let weights = weights.map_err(failed)?;
-            let rendering = backend.render(camera, scene.background, scene.sh_degree);
-            let rendering = rendering.map_err(failed)?;
             let (world, ray_camera) = scene.cameras(camera);
             let g_buffer = scene.g_buffer(name, &ray_camera)?;
-            visibility.add_depths(rows, &weights, &world, &g_buffer, |pixel| {
-                depth_at(&rendering, pixel, scene.normalisation.scale)
-            });
+            visibility.add_depths(rows, &weights, &world, &g_buffer);
             let places = visibility.seen_through.par_iter_mut().zip(&rows.centres);
             places.for_each(|(seen_through, &place)| {
                 *seen_through += u32::from(sees_through(&world, &g_buffer, place));
@@ -97,33 +89,13 @@ impl Visibility {
         Ok(visibility)
     }
 
-    /// Compares the depths of the rows that one view shows with the surface and with the rendered depth.
-    fn add_depths(
-        &mut self,
-        rows: &Rows,
-        weights: &[f32],
-        camera: &Camera,
-        g_buffer: &GBuffer,
-        rendered: impl Fn(usize) -> Option<f64>,
-    ) {
-        let last = |side: u32| f64::from(side.max(1) - 1);
-        for (&weight, &place) in weights.iter().zip(&rows.centres) {
-            let (pixel, depth) = camera.project(place);
-            if weight <= 0.0 || depth <= 0.0 || !pixel.is_finite() {
-                continue;
-            }
-            let weight = f64::from(weight);
-            let x = pixel.x.clamp(0.0, last(g_buffer.width)) as usize;
-            let y = pixel.y.clamp(0.0, last(g_buffer.height)) as usize;
-            let at = y * g_buffer.width as usize + x;
-            let shown = f64::from(g_buffer.depth[at]);
+    /// Compares the depths of the rows that one view shows with the surface.
+    fn add_depths(&mut self, rows: &Rows, weights: &[f32], camera: &Camera, g_buffer: &GBuffer) {
+        for Shown { weight, depth, pixel } in shown(rows, weights, camera) {
+            let surface = f64::from(g_buffer.depth[pixel]);
             self.before.1 += weight;
-            if shown > 0.0 && depth < (1.0 - BEFORE) * shown {
+            if surface > 0.0 && depth < (1.0 - BEFORE) * surface {
                 self.before.0 += weight;
-            }
-            if let Some(rendered) = rendered(at) {
-                self.squares.0 += weight * (depth - rendered) * (depth - rendered);
-                self.squares.1 += weight;
             }
         }
     }
@@ -133,11 +105,6 @@ impl Visibility {
         ratio(self.before.0, self.before.1)
     }
 
-    /// See [`DepthErrors::spread`](super::DepthErrors::spread).
-    pub(super) fn spread(&self, diagonal: f64) -> f64 {
-        ratio(self.squares.0, self.squares.1).sqrt() / diagonal
-    }
-
     /// Adds the blend weights of one view, and returns them. Shape: `[rows]`.
     fn add_weights(
         &mut self,
@@ -145,24 +112,9 @@ impl Visibility {
         scene: &KnownScene<'_>,
         camera: &Camera,
         request: &AuxRequest,
-    ) -> Result<Vec<f32>, densify_render::BackendError> {
-        let Camera { width, height, .. } = *camera;
-        let pixels = width as usize * height as usize;
-        // The requested weights do not depend on the target.
-        let target = Image8 { width, height, rgb: vec![0; 3 * pixels], alpha: None, mask: None };
-        let output = backend.observe(&AuxInput {
-            step: 1,
-            view: 0,
-            seed: 0,
-            camera,
-            target: &target,
-            background: scene.background,
-            exposure: None,
-            sh_degree: scene.sh_degree,
-            request,
-        })?;
+    ) -> Result<Vec<f32>, BackendError> {
         let mut weights = Vec::new();
-        for (column, values) in output.columns {
+        for (column, values) in observed(backend, scene, camera, request)? {
             let numbers = values.iter().map(|&value| f64::from(value));
             match column {
                 AuxColumn::WeightSum => {
@@ -177,7 +129,7 @@ impl Visibility {
                 _ => {}
             }
         }
-        self.blended.1 += pixels as f64;
+        self.blended.1 += f64::from(camera.width) * f64::from(camera.height);
         Ok(weights)
     }
 
@@ -207,6 +159,69 @@ impl Visibility {
             below_one_percent: ratio(negligible as f64, self.peaks.len() as f64),
         }
     }
+}
+
+/// The requested columns of a view.
+fn observed(
+    backend: &mut dyn Backend,
+    scene: &KnownScene<'_>,
+    camera: &Camera,
+    request: &AuxRequest,
+) -> Result<Vec<(AuxColumn, Vec<f32>)>, BackendError> {
+    let Camera { width, height, .. } = *camera;
+    let rgb = vec![0; 3 * width as usize * height as usize];
+    let output = backend.observe(&AuxInput {
+        step: 1,
+        view: 0,
+        seed: 0,
+        camera,
+        // Weights do not depend on the target.
+        target: &Image8 { width, height, rgb, alpha: None, mask: None },
+        background: scene.background,
+        exposure: None,
+        sh_degree: scene.sh_degree,
+        request,
+    })?;
+    Ok(output.columns)
+}
+
+/// The blend weights of one view. Shape: `[rows]`.
+pub(super) fn weights(
+    backend: &mut dyn Backend,
+    scene: &KnownScene<'_>,
+    camera: &Camera,
+) -> Result<Vec<f32>, BackendError> {
+    let columns = observed(backend, scene, camera, &needs().aux.unwrap_or_default())?;
+    let sums = columns.into_iter().find(|(column, _)| *column == AuxColumn::WeightSum);
+    Ok(sums.map(|(_, sums)| sums).unwrap_or_default())
+}
+
+/// A row that a view shows.
+pub(super) struct Shown {
+    /// Σ α·T in the view.
+    pub(super) weight: f64,
+    /// Camera z of the centre `[world units]`.
+    pub(super) depth: f64,
+    /// Index of the pixel of the centre, or of the nearest pixel.
+    pub(super) pixel: usize,
+}
+
+/// The rows with a weight in a view, and with a centre in front of its camera.
+pub(super) fn shown<'a>(
+    rows: &'a Rows,
+    weights: &'a [f32],
+    camera: &'a Camera,
+) -> impl Iterator<Item = Shown> + 'a {
+    let last = |side: u32| f64::from(side.max(1) - 1);
+    let (right, bottom) = (last(camera.width), last(camera.height));
+    weights.iter().zip(&rows.centres).filter_map(move |(&weight, &place)| {
+        let (pixel, depth) = camera.project(place);
+        if weight <= 0.0 || depth <= 0.0 || !pixel.is_finite() {
+            return None;
+        }
+        let (x, y) = (pixel.x.clamp(0.0, right) as usize, pixel.y.clamp(0.0, bottom) as usize);
+        Some(Shown { weight: f64::from(weight), depth, pixel: y * camera.width as usize + x })
+    })
 }
 
 /// True if a view sees through a point, to a surface behind it or to the background.
