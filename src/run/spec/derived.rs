@@ -149,11 +149,14 @@ impl RunSpec {
     ) -> Result<RateOptions, Failure> {
         let fail = |problem: &str| Failure::from(OptionProblem::value("lr", problem.trim()));
         let iterations = self.schedule.iterations.0;
-        let mut defaults = RateOptions::for_run(iterations).with(policy_rates);
+        let is_model = matches!(self.start.init, Some(InitChoice::Model(_)));
+        let is_fine = is_model && self.start.init_rates == InitRates::Fine;
+        let defaults = if is_fine { RateOptions::for_trained_model } else { RateOptions::for_run };
+        let mut defaults = defaults(iterations).with(policy_rates);
         defaults.mean_start *= position_factor;
         defaults.mean_end *= position_factor;
-        let is_model = matches!(self.start.init, Some(InitChoice::Model(_)));
-        if is_model && self.start.init_rates == InitRates::Fine {
+        defaults.noise_end = defaults.noise_end.map(|end| end * position_factor);
+        if is_fine {
             defaults = defaults.fine();
         }
         let mut table = Table::try_from(defaults).map_err(|error| fail(&error.to_string()))?;

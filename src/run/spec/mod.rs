@@ -310,9 +310,9 @@ run_spec! {
         seed: u64 = 0, Fixed, value "N";
 
         /// Set a learning rate: mean_start, mean_end, log_scale, quat, opacity, sh_dc, sh_rest; for all but the means
-        /// also NAME_end; fade: final factor of opacity, sh_dc and sh_rest, which sets in after the share fade_from of
-        /// the run; boost: initial factor of all rates (1 in runs of 30,000 iterations). A rate of 0 freezes its
-        /// values. May be repeated
+        /// also NAME_end; noise_end: noise on the means at the end; fade: final factor of opacity, sh_dc and sh_rest,
+        /// which sets in after the share fade_from of the run; boost: initial factor of all rates (1 in runs of 30,000
+        /// iterations). A rate of 0 freezes its values. May be repeated
         #[serde(with = "as_table")]
         lr: Vec<Assignment> = Vec::new(), Fixed, value "NAME=RATE";
 

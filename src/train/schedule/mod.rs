@@ -30,6 +30,9 @@ pub struct RateOptions {
     pub mean_start: f64,
     /// Means at the end of the run `[fraction of the extent per step]`, > 0.
     pub mean_end: f64,
+    /// Noise of policies that move means randomly, at the end of the run `[fraction of the extent per step]`, > 0. `None`
+    /// means as `mean_end`.
+    pub noise_end: Option<f64>,
     /// Log-scales, ≥ 0.
     pub log_scale: f32,
     /// Quaternions, ≥ 0.
@@ -71,6 +74,7 @@ impl RateOptions {
     pub const PUBLISHED: Self = Self {
         mean_start: 1.6e-4,
         mean_end: 1.6e-6,
+        noise_end: None,
         log_scale: 5e-3,
         quat: 1e-3,
         opacity: 0.025,
@@ -86,29 +90,43 @@ impl RateOptions {
         boost: 1.0,
     };
 
-    /// The default step sizes of a run. Runs of fewer than 30,000 iterations start with b = (30,000 / iterations)^0.6
-    /// times the published step sizes, at most 5 times, and the step size of colour bands 1–3 keeps an additional
-    /// factor of min(b, 2) to the end.
+    /// The default step sizes of a run. With s = 30,000 / iterations, at least 1, runs of fewer than 30,000 iterations
+    /// start with s^0.6 times the published step sizes, at most 5 times. The means end with s^0.77 times the published
+    /// step size, at most 10 times; log-scales and colour bands 1–3 keep a factor of min(s^0.6, 2) to the end. Noise ends
+    /// as published.
     ///
-    /// Short runs must reach the same result in fewer steps. In measurements on three scenes at 2,000–3,000 iterations,
-    /// the published step sizes left Gaussians far from their optimum, with training views as blurred as test views.
-    /// View-dependent colour, which has the smallest steps and starts last, still lagged behind: twice its step size
-    /// gave +0.39, +0.23 and +0.18 dB (cup, three seeds), +0.20 (office), +0.59 (beercan) and −0.04 (room256); a factor
-    /// of four gave less. The larger step size costs quality where colour does not depend on the view: −0.76 dB on the
-    /// built-in `scene:room`, where the published `sh_rest` of 1.25e-4 is better.
+    /// Short runs must reach the same result in fewer steps. With the published step sizes, Gaussians stayed far from
+    /// their optimum, with training views as blurred as test views, and view-dependent colour, which has the smallest
+    /// steps and starts last, lagged behind. The factors are those with which half of the iterations reach the scores of
+    /// the earlier rules (`docs/studies/short-runs.tsv`). With a larger boost, training diverges on photographs.
     pub fn for_run(iterations: u32) -> Self {
         let shortage = f64::from(REFERENCE_ITERATIONS) / f64::from(iterations.max(1));
         let boost = shortage.powf(0.6).clamp(1.0, 5.0);
         let published = Self::PUBLISHED;
-        Self { boost, sh_rest: published.sh_rest * boost.min(2.0) as f32, ..published }
+        let kept = boost.min(2.0) as f32;
+        Self {
+            boost,
+            mean_end: published.mean_end * shortage.powf(0.77).clamp(1.0, 10.0),
+            noise_end: (shortage > 1.0).then_some(published.mean_end),
+            log_scale: published.log_scale * kept,
+            sh_rest: published.sh_rest * kept,
+            ..published
+        }
     }
 
-    /// These rates with the final step sizes in the whole run, for models that are trained already: larger steps would
-    /// cost such models 4 to 6 dB at first.
+    /// The default step sizes of a run that refines a trained model, before they are made [fine](Self::fine): the
+    /// published ones, since larger steps would cost such models 4 to 6 dB at first. Only the step size of colour bands
+    /// 1–3 is that of [`for_run`](Self::for_run).
+    pub fn for_trained_model(iterations: u32) -> Self {
+        Self { sh_rest: Self::for_run(iterations).sh_rest, ..Self::PUBLISHED }
+    }
+
+    /// These step sizes with the final ones in the whole run.
     #[must_use]
     pub fn fine(self) -> Self {
         Self {
             mean_start: self.mean_end,
+            noise_end: None,
             log_scale: self.log_scale_end.unwrap_or(self.log_scale),
             quat: self.quat_end.unwrap_or(self.quat),
             opacity: self.opacity_end.unwrap_or(self.opacity),
@@ -130,6 +148,7 @@ impl RateOptions {
         let mut rates = self;
         if let Some(mean) = overrides.mean {
             (rates.mean_start, rates.mean_end) = (mean.start, mean.end);
+            rates.noise_end = None;
         }
         for (start, end, rate) in [
             (&mut rates.log_scale, &mut rates.log_scale_end, overrides.log_scale),
@@ -156,7 +175,9 @@ impl RateOptions {
         let between = |start: f64, end: f64| {
             if start > 0.0 { ((1.0 - t) * start.ln() + t * end.ln()).exp() } else { 0.0 }
         };
-        let mean = between(self.mean_start, self.mean_end) * f64::from(extent);
+        let extent = f64::from(extent);
+        let mean = between(self.mean_start, self.mean_end) * extent;
+        let noise = between(self.mean_start, self.noise_end.unwrap_or(self.mean_end)) * extent;
         let factor = self.boost.powf(1.0 - t);
         let late = (t - self.fade_from).max(0.0) / (1.0 - self.fade_from).max(f64::MIN_POSITIVE);
         let faded = factor * self.fade.powf(late);
@@ -166,7 +187,7 @@ impl RateOptions {
         };
         LearningRates {
             mean: (mean * factor) as f32,
-            noise: mean as f32,
+            noise: noise as f32,
             log_scale: times(factor, self.log_scale, self.log_scale_end),
             quat: times(factor, self.quat, self.quat_end),
             opacity: times(faded, self.opacity, self.opacity_end),
@@ -188,6 +209,7 @@ impl RateOptions {
         ];
         let above_0 = [
             ("mean_end", self.mean_end),
+            ("noise_end", self.noise_end.unwrap_or(1.0)),
             ("boost", self.boost),
             ("fade", self.fade),
             ("fade_from", self.fade_from),

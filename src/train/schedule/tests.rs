@@ -5,7 +5,7 @@ use densify_policies::policy::{Fade, Rate};
 use super::*;
 
 #[test]
-fn short_runs_start_with_larger_step_sizes_and_end_with_the_published_ones() {
+fn short_runs_have_larger_step_sizes() {
     let published = RateOptions::default();
     assert_eq!(RateOptions::for_run(30_000), published);
     assert_eq!(RateOptions::for_run(100_000), published);
@@ -16,13 +16,21 @@ fn short_runs_start_with_larger_step_sizes_and_end_with_the_published_ones() {
     close(start.mean, 1.6e-4 * factor);
     close(start.opacity, published.opacity * factor);
     close(short.at(1_500, 3_000, 1.0).quat, published.quat * factor.sqrt());
-    close(end.mean, 1.6e-6);
+    close(end.mean, 1.6e-6 * 10_f32.powf(0.77));
+    close(start.noise, 1.6e-4);
+    close(end.noise, 1.6e-6);
+    close(start.log_scale, 2.0 * published.log_scale * factor);
+    close(end.log_scale, 2.0 * published.log_scale);
     close(start.sh_rest, 2.0 * published.sh_rest * factor);
     close(end.sh_rest, 2.0 * published.sh_rest);
     // A slightly shorter run has slightly larger step sizes.
     let factor = 1.25_f32.powf(0.6);
     close(RateOptions::for_run(24_000).sh_rest, published.sh_rest * factor);
     close(RateOptions::for_run(1).boost as f32, 5.0);
+    close(RateOptions::for_run(1).mean_end as f32, 1.6e-5);
+    // A trained model is refined with the published step sizes.
+    let refined = RateOptions::for_trained_model(3_000);
+    assert_eq!(refined, RateOptions { sh_rest: short.sh_rest, ..published });
 }
 
 #[test]

@@ -1,5 +1,6 @@
-//! Stage 4: the image loss 0.8·L1 + 0.2·(1 − SSIM) and its gradient (Kerbl et al. 2023, section 5.1;
-//! SSIM of Wang et al. 2004 with an 11×11 Gaussian window of σ = 1.5 and zero padding).
+//! Stage 4: the image loss 0.8·L1 + 0.2·(1 − SSIM) (Kerbl et al. 2023, section 5.1; SSIM of Wang et al. 2004 with an
+//! 11×11 Gaussian window of σ = 1.5 and zero padding), and the gradient that training follows. The gradient is that of
+//! the same loss with Huber's function (1964) in place of |e|: e²/(2δ) up to δ = [`HUBER`], |e| − δ/2 beyond.
 //!
 //! SSIM is written in terms of the difference e = x − y of rendering x and target y, by an exact identity:
 //! SSIM = (1 − μₑ²/A)·(1 − Var(e)/B), A = μₓ² + μᵧ² + C₁, B = Var(x) + Var(y) + C₂.
@@ -41,6 +42,9 @@ const C1: f32 = 0.01 * 0.01;
 const C2: f32 = 0.03 * 0.03;
 /// Weight of 1 − SSIM; L1 has the rest.
 pub(crate) const SSIM_WEIGHT: f32 = 0.2;
+/// The pixel difference from which the gradient no longer grows. The gradient of |e| is as large for a pixel that is
+/// almost right as for a wrong one, and keeps moving Gaussians that fit well.
+pub(crate) const HUBER: f32 = 0.1;
 /// The constant subtracted from y.
 const MIDDLE: f32 = 0.5;
 /// Image rows per strip in passes that write whole tiles.
@@ -510,9 +514,8 @@ impl WithSimd for Gradient<'_> {
         let ([zeros, out, pixels], mut lines) = scratch_lines::<3, 3>(scratch, segments);
         zeros.fill([0.0; WIDTH]);
         let pixels = pixels.as_flattened_mut();
-        let l1_scale = (1.0 - SSIM_WEIGHT) * scale;
+        let pixel_scale = (1.0 - SSIM_WEIGHT) / HUBER * scale;
         let ssim_scale = -SSIM_WEIGHT * scale;
-        let zero = V::zero(s);
         if rows < STRIP {
             for tile in tiles.iter_mut() {
                 tile.planes[channel] = ZERO_PLANE;
@@ -539,9 +542,8 @@ impl WithSimd for Gradient<'_> {
                     for n in 0..TOGETHER {
                         let (e, y) = (V::load(s, &e[n][lane..]), V::load(s, &y[n][lane..]));
                         let by_ssim = by_mu_e[n] + e * 2.0 * by_ee[n] + y * by_ey[n];
-                        let positive = zero.lt(e).keep(V::splat(s, l1_scale));
-                        let negative = e.lt(zero).keep(V::splat(s, l1_scale));
-                        let g = by_ssim * ssim_scale + (positive - negative);
+                        let bounded = e.min(V::splat(s, HUBER)).max(V::splat(s, -HUBER));
+                        let g = by_ssim.mul_add(V::splat(s, ssim_scale), bounded * pixel_scale);
                         g.store(&mut out[n][lane..]);
                     }
                 }

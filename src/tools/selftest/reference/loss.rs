@@ -1,11 +1,13 @@
-//! The training loss, 0.8 · L1 + 0.2 · (1 − SSIM), and its derivative, straight from the definition.
+//! The training loss, 0.8 · L1 + 0.2 · (1 − SSIM), and the gradient that training follows, straight from the definition.
 
 /// Radius of the 11×11 window `[px]`.
 const REACH: i64 = 5;
 const C1: f64 = 0.0001;
 const C2: f64 = 0.0009;
+/// The difference from which Huber's function is linear.
+const HUBER: f64 = 0.1;
 
-/// The loss, its parts, and dL/d(rendered).
+/// The loss, its parts, and its gradient.
 #[derive(Debug, Clone)]
 pub struct Loss {
     /// 0.8 · L1 + 0.2 · (1 − SSIM).
@@ -14,7 +16,9 @@ pub struct Loss {
     pub l1: f64,
     /// Mean SSIM.
     pub ssim: f64,
-    /// dL/d(rendered). Shape: [height, width, 3].
+    /// The loss with the mean of Huber's function in place of L1, which training minimises.
+    pub smoothed: f64,
+    /// Gradient of `smoothed` with respect to the rendering. Shape: [height, width, 3].
     pub gradient: Vec<f64>,
     /// Absolute error and 1 − SSIM of each pixel, means over channels.
     pub by_pixel: Vec<[f64; 2]>,
@@ -80,16 +84,19 @@ pub fn loss(rendered: &[f64], target: &[f64], width: usize, height: usize) -> Lo
     }
     ssim /= n;
     let (d_mx, d_xx, d_xy) = (blurred(&d_mx), blurred(&d_xx), blurred(&d_xy));
-    let mut l1 = 0.0;
+    let (mut l1, mut huber) = (0.0, 0.0);
     let gradient = (0..rendered.len())
         .map(|i| {
             let error = rendered[i] - target[i];
             l1 += error.abs();
-            let sign = if error == 0.0 { 0.0 } else { error.signum() };
+            let near = error.abs().min(HUBER);
+            huber += near * (error.abs() - near / 2.0) / HUBER;
+            let by_pixel = (error / HUBER).clamp(-1.0, 1.0);
             let d_ssim = d_mx[i] + 2.0 * rendered[i] * d_xx[i] + target[i] * d_xy[i];
-            (0.8 * sign - 0.2 * d_ssim) / n
+            (0.8 * by_pixel - 0.2 * d_ssim) / n
         })
         .collect();
     l1 /= n;
-    Loss { loss: 0.8 * l1 + 0.2 * (1.0 - ssim), l1, ssim, gradient, by_pixel }
+    let with = |pixels: f64| 0.8 * pixels + 0.2 * (1.0 - ssim);
+    Loss { loss: with(l1), l1, ssim, smoothed: with(huber / n), gradient, by_pixel }
 }
