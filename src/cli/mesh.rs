@@ -13,11 +13,11 @@ use densify_core::memory::Bytes;
 use densify_core::numbers::{counted, grouped, percent};
 use densify_inspect::{Limits, mesh_values};
 use densify_mesh::{
-    DepthKind, DepthSource, FuseOptions, Fused, MeshError, MeshErrors, MeshFormat, ModelSource,
-    Region, fuse, score,
+    DepthSource, FuseOptions, Fused, MeshError, MeshErrors, MeshFormat, ModelSource, Region, fuse,
+    score,
 };
 use densify_policies::policy::Needs;
-use densify_render::BackendChoice;
+use densify_render::{BackendChoice, DepthKind};
 use densify_run::coordinate_check::CoordinateCheck;
 use densify_run::failure::Failure;
 use densify_run::{ByteCount, DeviceSpec, ProcessMemory};
@@ -67,9 +67,10 @@ pub(super) struct MeshArgs {
     #[arg(long, value_name = "SIZE")]
     memory: Option<ByteCount>,
     /// Depth of a pixel: expected (the mean of the Gaussians blended into it, Σ α·T·z / Σ α·T), or median (of the one
-    /// that reduces the transmittance to below one half)
-    #[arg(long, value_name = "KIND", default_value_t = DepthKind::default())]
-    depth_kind: DepthKind,
+    /// that reduces the transmittance to below one half) `[default: expected for a run that was trained on depth, else
+    /// median]`
+    #[arg(long, value_name = "KIND")]
+    depth_kind: Option<DepthKind>,
     /// Ignore pixels whose Gaussians' depths have a standard deviation above this fraction of the depth
     #[arg(long, value_name = "FRACTION", default_value_t = 0.4, value_parser = not_negative)]
     max_spread: f64,
@@ -156,11 +157,15 @@ pub(super) fn run(args: &MeshArgs, matches: &ArgMatches, console: &Console) -> R
     let background = opened.data.background.fixed();
     CoordinateCheck::measure(opened.backend.as_mut(), &views, (background, opened.sh_degree))?
         .require(None, &args.model, console)?;
+    // Depth in the loss makes the expected depth exact; without it, Gaussians before the surface pull it forward.
+    let usual = if opened.trained_on_depth { DepthKind::Expected } else { DepthKind::Median };
+    let depth = args.depth_kind.unwrap_or(usual);
+    console.say(format_args!("depth    {depth} depth of each pixel"));
     let mut source = ModelSource {
         backend: opened.backend.as_mut(),
         views: &views,
         sh_degree: opened.sh_degree,
-        depth: args.depth_kind,
+        depth,
         max_spread: args.max_spread as f32,
     };
     // Memory is measured after a view was rendered, since the renderer's lists take some only then.
@@ -206,7 +211,7 @@ fn failure_of(error: MeshError) -> Failure {
 pub(super) fn on_processor(device: &DeviceSpec) -> Result<DeviceSpec, Failure> {
     if device.backend == BackendChoice::Gpu || device.gpu.is_some() {
         return Err(Failure::input(
-            "--backend: depth is rendered on the processor only; leave out --backend and --gpu",
+            "--backend: this depth is rendered on the processor only; leave out --backend and --gpu",
         ));
     }
     Ok(DeviceSpec { backend: BackendChoice::Cpu, ..device.clone() })

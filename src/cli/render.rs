@@ -8,11 +8,13 @@ use densify_policies::policy::Needs;
 
 use super::console::Console;
 use super::film::{self, FilmArgs};
+use super::mesh::on_processor;
 use super::threads::open_machine;
 use densify_core::antialiasing::Antialiasing;
 use densify_core::camera_path;
 use densify_data::views::ViewSource;
 use densify_inspect::{CameraRoute, Channels, FilmSource, PictureFolder, file_names};
+use densify_render::DepthKind;
 use densify_run::failure::Failure;
 use densify_run::finished::{Opened, is_model, iteration, model_file, open, open_alone, open_run};
 use densify_run::{DataSpec, DeviceSpec, Fraction, RunConfig};
@@ -23,8 +25,8 @@ use densify_train::evaluate::Split;
 /// Renders the held-out views or the training views of a run, or of any file of Gaussian splats (which needs
 /// --scene for the cameras); or, with --path, a camera path through the scene, and a film of it.
 ///
-/// Depth is the mean Σ α·T·z / Σ α·T along each ray, measured along the optical axis in the dataset's
-/// own units, and 0 where the opacity Σ α·T is below one half. It is written as a NumPy array
+/// Depth is the mean Σ α·T·z / Σ α·T along each ray (or the median: --depth-kind), measured along the
+/// optical axis in the dataset's own units, and 0 where the opacity Σ α·T is below one half. It is written as a NumPy array
 /// (NAME.depth.npy) and in 16 bits (NAME.depth.png), whose unit is in depth.json: thousandths, unless
 /// another power of ten fits better.
 #[derive(Debug, Args)]
@@ -52,6 +54,10 @@ pub(super) struct RenderArgs {
     /// Also write depth, as NAME.depth.png and NAME.depth.npy
     #[arg(long)]
     depth: bool,
+    /// Depth of a pixel: expected (the mean of the Gaussians blended into it), or median (of the one that reduces the
+    /// transmittance to below one half; on the processor only)
+    #[arg(long, value_name = "KIND", default_value_t = DepthKind::Expected, requires = "depth")]
+    depth_kind: DepthKind,
     /// Also write photograph and render side by side, as NAME.pair.png
     #[arg(long)]
     side_by_side: bool,
@@ -95,7 +101,12 @@ pub(super) fn run(
     matches: &ArgMatches,
     console: &Console,
 ) -> Result<(), Failure> {
-    let channels = Channels { alpha: args.alpha, depth: args.depth };
+    let channels = Channels { alpha: args.alpha, depth: args.depth.then_some(args.depth_kind) };
+    let device = match channels.depth {
+        Some(DepthKind::Median) => on_processor(&args.rendering.device)?,
+        _ => args.rendering.device.clone(),
+    };
+    let rendering = &RenderingArgs { device, ..args.rendering.clone() };
     if args.film.path.is_some() && args.side_by_side {
         return Err(Failure::input(
             "--side-by-side: a camera path has no photographs; leave it out",
@@ -112,10 +123,10 @@ pub(super) fn run(
         && args.scene.is_none()
         && is_model(&args.model)
     {
-        let source = argument.open_without_dataset(file, &args.rendering, console)?;
+        let source = argument.open_without_dataset(file, rendering, console)?;
         return film::run(&args.film, route, &args.output, channels, source, console);
     }
-    let mut opened = argument.open(&args.rendering, Needs::default(), matches, console)?;
+    let mut opened = argument.open(rendering, Needs::default(), matches, console)?;
     if let Some(route) = path {
         return film::run(&args.film, route, &args.output, channels, opened.into(), console);
     }
@@ -125,7 +136,9 @@ pub(super) fn run(
     let files = file_names(&names);
     let mut folder = PictureFolder::new(&args.output, channels, &opened.dataset.normalisation);
     for (view, name) in files.iter().enumerate() {
-        let rendering = opened.backend.render(views.camera(view), background, opened.sh_degree)?;
+        let backend = opened.backend.as_mut();
+        let rendering =
+            channels.render(backend, views.camera(view), background, opened.sh_degree)?;
         folder.write(name, &rendering)?;
         if args.side_by_side {
             let image = views.image(view).map_err(Failure::input)?;

@@ -1,8 +1,40 @@
 //! Renderings for people who inspect a model. Training needs none of them.
 
+use std::str::FromStr;
+
 use densify_core::camera::Camera;
 
 use super::{BackendError, Rendering};
+
+/// The depth of a pixel.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum DepthKind {
+    /// Expected depth Σ α·T·z / Σ α·T.
+    Expected,
+    /// Depth of the row at which transmittance falls below ½.
+    Median,
+}
+
+impl FromStr for DepthKind {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        match text {
+            "expected" => Ok(Self::Expected),
+            "median" => Ok(Self::Median),
+            _ => Err("give expected or median".to_owned()),
+        }
+    }
+}
+
+impl std::fmt::Display for DepthKind {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(match self {
+            Self::Expected => "expected",
+            Self::Median => "median",
+        })
+    }
+}
 
 /// Depths of a view: camera-space z, with each row at the depth of its mean `[scene units]`. Shape of each:
 /// `[height, width]`.
@@ -20,6 +52,16 @@ pub struct SurfaceDepths {
     pub median: Vec<f32>,
     /// Standard deviation of the depths with weights α·T; 0 where alpha is 0.
     pub spread: Vec<f32>,
+}
+
+impl SurfaceDepths {
+    /// The depths of this kind.
+    pub fn of_kind(&self, kind: DepthKind) -> &[f32] {
+        match kind {
+            DepthKind::Expected => &self.expected,
+            DepthKind::Median => &self.median,
+        }
+    }
 }
 
 /// Blend weights of a row, summed over the pixels of a view.
@@ -60,6 +102,7 @@ pub trait Inspect {
     fn render_counts(&mut self, _camera: &Camera) -> Result<Rendering, BackendError> {
         Err(BackendError::Unsupported("counting the Gaussians per pixel"))
     }
+
     /// Renders the depths of a view.
     ///
     /// # Errors

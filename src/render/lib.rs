@@ -44,7 +44,7 @@ pub use densify_shaders::Accumulation;
 pub use depth::{DepthTarget, DepthTerm};
 pub use differentiable::{Differentiable, ImageGradient};
 pub use error::{BackendError, Fit};
-pub use inspect::{Inspect, RowWeights, SurfaceDepths};
+pub use inspect::{DepthKind, Inspect, RowWeights, SurfaceDepths};
 pub use setup::{KeptPhotographs, MomentStorage, ParameterStorage, Setup, Shortcuts, Storage};
 pub use state::{StateArray, StateError, Tensor, Values};
 

@@ -99,6 +99,8 @@ pub struct Opened {
     pub dataset: Dataset,
     /// Options with which the dataset was read.
     pub data: DataSpec,
+    /// True for the model of a run that was trained on given depth.
+    pub trained_on_depth: bool,
     /// Spherical-harmonic degree of the model.
     pub sh_degree: u8,
     /// The backend, which contains the model.
@@ -131,8 +133,10 @@ pub fn open_run(
     let path = moved_to.unwrap_or_else(|| config.scene_path());
     let model = model_path(run, iteration);
     let near = |dataset: &Dataset| near_plane_of_run(&config, dataset, observer);
-    open_with(&model, &path, config.spec.data.clone(), &near, (antialias, machine), needs, observer)
-        .map_err(|failure| if was_moved { failure } else { or_moved(failure, &path) })
+    let data = config.spec.data.clone();
+    let opened = open_with(&model, &path, data, &near, (antialias, machine), needs, observer)
+        .map_err(|failure| if was_moved { failure } else { or_moved(failure, &path) })?;
+    Ok(Opened { trained_on_depth: config.resolved.depth.is_some(), ..opened })
 }
 
 /// Opens a model, written by any program, with a dataset. Without `near`, the near plane is [chosen](NearPlane) for the
@@ -166,7 +170,7 @@ fn open_with(
     let sh_degree = model.sh_degree;
     let near = near(&dataset);
     let backend = machine.backend_for(&dataset, model, near, needs)?;
-    Ok(Opened { sh_degree, backend, dataset, data })
+    Ok(Opened { sh_degree, backend, dataset, data, trained_on_depth: false })
 }
 
 /// Opens a model without a dataset, for cameras in its own coordinates. Also returns its normalisation and degree.

@@ -49,7 +49,8 @@ pub(super) fn measure(session: Session<'_>, folder: &Path) -> Result<(), Failure
     let model = run.dataset.normalisation.model_from_world(model);
     let backend = measurement.device.backend(&model, &measurement.for_rows(model.len()))?;
     let (dataset, data) = (run.dataset, run.spec.data);
-    let mut opened = Opened { sh_degree: model.sh_degree, backend, dataset, data };
+    let (sh_degree, trained_on_depth) = (model.sh_degree, dataset.depth.is_some());
+    let mut opened = Opened { sh_degree, backend, dataset, data, trained_on_depth };
     drop(model);
     let measured = match opened.geometry(&run.test, &|| observer.interrupt().is_some()) {
         Ok(None) => return Ok(()),

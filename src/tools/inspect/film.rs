@@ -226,7 +226,7 @@ impl Film {
             if in_world {
                 camera = normalisation.scene_from_world_camera(&camera);
             }
-            let rendering = backend.render(&camera, background, sh_degree)?;
+            let rendering = channels.render(backend.as_mut(), &camera, background, sh_degree)?;
             pictures.write(&format!("frame_{frame:05}"), &rendering)?;
             if let Some(Video::WebP(path, animation)) = &mut video {
                 animation

@@ -5,10 +5,11 @@ use std::path::{Path, PathBuf};
 
 use image::{DynamicImage, ImageBuffer, Luma};
 
+use densify_core::camera::Camera;
 use densify_core::files::{FileError, write_atomically};
 use densify_core::image::Image8;
 use densify_data::dataset::normalise::Normalisation;
-use densify_render::Rendering;
+use densify_render::{Backend, BackendError, DepthKind, Rendering};
 use densify_train::output::write_json;
 use densify_train::pictures::{photograph, picture, side_by_side, to_u8, write_png};
 
@@ -23,8 +24,30 @@ const COARSE_STEPS: f64 = 1000.0;
 pub struct Channels {
     /// Opacity, as `NAME.alpha.png`.
     pub alpha: bool,
-    /// Mean depth in 16 bits, as `NAME.depth.png`, and in f32, as `NAME.depth.npy`.
-    pub depth: bool,
+    /// Depth in 16 bits, as `NAME.depth.png`, and in f32, as `NAME.depth.npy`.
+    pub depth: Option<DepthKind>,
+}
+
+impl Channels {
+    /// Renders a view. Its depth, divided by alpha, is of the requested kind.
+    ///
+    /// # Errors
+    /// See [`BackendError`]; median depth is unsupported on a GPU.
+    pub fn render(
+        &self,
+        backend: &mut dyn Backend,
+        camera: &Camera,
+        background: [f32; 3],
+        sh_degree: u8,
+    ) -> Result<Rendering, BackendError> {
+        let mut rendering = backend.render(camera, background, sh_degree)?;
+        if self.depth == Some(DepthKind::Median) {
+            let depths = backend.inspect()?.render_depths(camera)?;
+            let products = depths.median.iter().zip(&rendering.alpha).map(|(depth, a)| depth * a);
+            rendering.depth = products.collect();
+        }
+        Ok(rendering)
+    }
 }
 
 /// A folder that renderings are written to.
@@ -61,7 +84,7 @@ impl PictureFolder {
         if self.channels.alpha {
             write_png(&file(".alpha.png"), &alpha(rendering))?;
         }
-        if self.channels.depth {
+        if self.channels.depth.is_some() {
             let depth = mean_depth(rendering, self.units);
             let (width, height) = (rendering.width, rendering.height);
             let (png, unit) = depth_picture((width, height), &depth);
@@ -96,8 +119,10 @@ impl PictureFolder {
         if self.depth_units.is_empty() {
             return Ok(());
         }
+        let kind = self.channels.depth.unwrap_or(DepthKind::Expected);
         let scale = serde_json::json!({
-            "what": "mean depth along the optical axis in the dataset's own units: values of .npy, and values of .png \
+            "kind": kind.to_string(),
+            "what": "depth along the optical axis in the dataset's own units: values of .npy, and values of .png \
                      times their unit; 0 where the opacity is below one half",
             "unit": self.depth_units,
         });

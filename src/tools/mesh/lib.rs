@@ -32,7 +32,7 @@ pub use densify_train::metrics::geometry::MeshErrors;
 pub use extent::Region;
 pub use frame::DepthFrame;
 pub use mesh::Mesh;
-pub use model::{DepthKind, ModelSource};
+pub use model::ModelSource;
 pub use score::score;
 pub use write::MeshFormat;
 

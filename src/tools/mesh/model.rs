@@ -1,47 +1,14 @@
 //! The depth maps of a model of Gaussian splats.
 
-use std::str::FromStr;
-
 use densify_core::camera::Camera;
 use densify_data::views::ViewSource;
-use densify_render::Backend;
+use densify_render::{Backend, DepthKind};
 use densify_run::failure::Failure;
 
 use super::{DepthFrame, DepthSource};
 
 /// Pixels whose alpha is lower show no surface.
 const MIN_ALPHA: f32 = 0.5;
-
-/// The depth of a pixel.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum DepthKind {
-    /// Expected depth Σ α·T·z / Σ α·T.
-    Expected,
-    /// Depth of the Gaussian at which transmittance falls below ½.
-    #[default]
-    Median,
-}
-
-impl FromStr for DepthKind {
-    type Err = String;
-
-    fn from_str(text: &str) -> Result<Self, String> {
-        match text {
-            "expected" => Ok(Self::Expected),
-            "median" => Ok(Self::Median),
-            _ => Err("give expected or median".to_owned()),
-        }
-    }
-}
-
-impl std::fmt::Display for DepthKind {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.write_str(match self {
-            Self::Expected => "expected",
-            Self::Median => "median",
-        })
-    }
-}
 
 /// The views of a dataset, rendered from a model by the native backend.
 pub struct ModelSource<'a, V> {
@@ -70,11 +37,9 @@ impl<V: ViewSource> DepthSource for ModelSource<'_, V> {
         let camera = self.views.camera(view);
         let rendering = self.backend.render(camera, [0.0; 3], self.sh_degree)?;
         let depths = self.backend.inspect()?.render_depths(camera)?;
+        let of_kind = depths.of_kind(self.depth);
         let depth = (0..depths.alpha.len()).map(|at| {
-            let value = match self.depth {
-                DepthKind::Expected => depths.expected[at],
-                DepthKind::Median => depths.median[at],
-            };
+            let value = of_kind[at];
             let is_shown = depths.alpha[at] >= MIN_ALPHA
                 && depths.spread[at] <= self.max_spread * depths.expected[at];
             if is_shown && value.is_finite() { value } else { 0.0 }

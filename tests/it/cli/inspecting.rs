@@ -149,6 +149,14 @@ fn render_writes_images_of_the_views() {
         largest = largest.max(value);
     }
     assert!((3.0..6.0).contains(&largest), "{largest}");
+    // The median depth is that of one Gaussian, not a mean.
+    let median = root.path().join("median");
+    let words = format!("render {} -o {} --depth --depth-kind median", text(&run), text(&median));
+    call(&format!("{words} --backend gpu")).refused("a GPU", &["--backend", "processor"]);
+    call(&words).ok();
+    assert_eq!(json(&median.join("depth.json"))["kind"], "median");
+    assert_eq!(json(&pictures.join("depth.json"))["kind"], "expected");
+    assert!(std::fs::read(median.join(arrays[0])).unwrap() != array);
     // The pair shows the photograph on the left and the rendering on the right.
     let pair = open("view_00.pair.png").into_rgb8();
     let (photograph, rendering) = (

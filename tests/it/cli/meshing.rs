@@ -47,6 +47,17 @@ fn meshes_of_all_formats_are_scored_alike() {
         }
         assert_eq!(meshes::read(&file(name)).expect(name).triangles.len(), ply.triangles.len());
     }
+    assert!(stdout.contains("depth    median depth"), "{stdout}");
+    // Where depth was trained on, the expected depth of a pixel is the better one.
+    let with_depth = root.path().join("with-depth");
+    train(&scene, &with_depth, 20, "--budget 2k --depth on --quiet").ok();
+    let words =
+        |flags: &str| format!("mesh {} -o {} {flags}", text(&with_depth), text(&file("f.ply")));
+    let stdout = call(&words("")).ok().stdout;
+    assert!(stdout.contains("depth    expected depth"), "{stdout}");
+    let expected = read(&file("f.ply"));
+    call(&words("--depth-kind median --overwrite")).ok();
+    assert!(read(&file("f.ply")) != expected);
     // Neither threads nor passes change the file; a model file gives the same mesh as its run.
     // The least memory that suffices depends on the program's own size.
     let outcomes = (32..512).step_by(8).map(|mebibytes| {
