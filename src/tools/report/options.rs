@@ -14,7 +14,8 @@ use densify_run::{Partial, RunSpec};
 /// Maximum number of rows of the table of differences; more would not be readable.
 const MAX_DIFFERENCES: usize = 60;
 /// Options that are paths on the machine that trained the run; only their last component is published.
-const PATHS: [&str; 7] = ["scene", "images", "sparse", "views", "init", "freeze", "policy_file"];
+const PATHS: [&str; 8] =
+    ["scene", "images", "sparse", "views", "depth_points", "init", "freeze", "policy_file"];
 
 /// All options with their full names, such as `knob.alpha_min`, and their values as text.
 pub(super) fn flatten(options: &Table) -> BTreeMap<String, String> {
