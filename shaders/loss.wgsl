@@ -1,5 +1,5 @@
-// Stage 4: 0.8·L1 + 0.2·(1 − SSIM), and its gradient with Huber's function in place of |e|, one tile per group and one
-// channel per launch, as in src/render/cpu/loss/.
+// Stage 4: 0.8·L1 + 0.2·(1 − SSIM), and its gradient with the policy's pixel term in place of L1, one tile per group and
+// one channel per launch, as in src/render/cpu/loss/.
 // SSIM is rewritten, exactly, in terms of e = x − y, the difference of rendering x and target y, and of the
 // mean of x·y, from which the sum of both variances follows. The 11×11 window is separable; pixels outside the image
 // are zero. An invocation sums neighbouring windows at once, eight below or four beside one another: eight together read
@@ -29,7 +29,8 @@
 const C1: f32 = 0.01 * 0.01;
 const C2: f32 = 0.03 * 0.03;
 const SSIM_WEIGHT: f32 = 0.2;
-const HUBER: f32 = 0.1;
+// The pixel difference from which the gradient no longer grows; 0 for L1.
+override PIXEL_BOUND: f32 = 0.0;
 // Radius of the window [px].
 const REACH: i32 = 5;
 // Side of a tile with its margin of REACH pixels.
@@ -352,7 +353,10 @@ fn pixel_gradient(
     for (var p = 0u; p < four.inside; p++) {
         let ey = difference(vec2<i32>(four.pixel + vec2(p, 0u)), channel);
         let by_ssim = sums[0][p] + 2.0 * ey.x * sums[1][p] + ey.y * sums[2][p];
-        let by_pixel = clamp(ey.x / HUBER, -1.0, 1.0);
+        var by_pixel = sign(ey.x);
+        if PIXEL_BOUND > 0.0 {
+            by_pixel = clamp(ey.x / PIXEL_BOUND, -1.0, 1.0);
+        }
         let g = (1.0 - SSIM_WEIGHT) * scale * by_pixel - SSIM_WEIGHT * scale * by_ssim;
         // The loss is a function of e·mask, so the chain rule multiplies by the mask.
         let to = four.place + p;

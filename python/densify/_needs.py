@@ -135,6 +135,7 @@ class Needs:
     error_score: ErrorScore | None = None
     candidates: Candidates | None = None
     aux: Aux | None = None
+    pixel_loss: Literal["l1", "huber"] = "l1"
     loss_terms: LossTerms | None = None
     noise: NoiseTerm | None = None
     mask: MaskTerm | None = None

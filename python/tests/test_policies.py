@@ -306,6 +306,7 @@ def test_schedules_and_views(scene: Path, tmp_path: Path) -> None:
         needs={
             "aux": aux,
             "cadence": densify.Cadence(all=2),
+            "pixel_loss": "huber",
             "loss_terms": densify.LossTerms(opacity=0.01),
             "noise": densify.NoiseTerm(1.0, 100.0, 0.005),
             "least_resolution": 0.5,

@@ -7,20 +7,26 @@ use densify::render::{Backend, StepInput, StepOutput};
 use densify::selftest::compare::{Table, relative_error};
 use densify::selftest::{Setup, Subject, scenes};
 use densify_policies::policy::{
-    Cadence, LossTerms, MaskTerm, Needs, NoiseTerm, Signal, SignalKind, SignalSet,
+    Cadence, LossTerms, MaskTerm, Needs, NoiseTerm, PixelLoss, Signal, SignalKind, SignalSet,
 };
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use crate::subject::{BLUE, RATES, make, make_with, others, step_input, wide};
+use crate::subject::{BLUE, RATES, make_with, others, step_input, wide};
 
 #[test]
 fn loss_and_gradient_match_the_native_backend() {
     let empty = Gaussians::default();
-    let mut native = make(&Subject::NATIVE, &empty);
-    for subject in others() {
-        let mut table = Table::new(&format!("loss, {} against native", subject.name()));
-        let mut backend = make(&subject, &empty);
+    let make = |subject: &Subject, pixel_loss| {
+        let needs = Needs { pixel_loss, ..Needs::default() };
+        make_with(subject, &empty, Setup { needs, ..Setup::default() })
+    };
+    let terms = |subject| [PixelLoss::L1, PixelLoss::Huber].map(|pixel_loss| (subject, pixel_loss));
+    for (subject, pixel_loss) in others().iter().flat_map(terms) {
+        let name = subject.name();
+        let mut table = Table::new(&format!("loss with {pixel_loss:?}, {name} against native"));
+        let mut native = make(&Subject::NATIVE, pixel_loss);
+        let mut backend = make(subject, pixel_loss);
         // Includes widths with every possible remainder in the last SIMD vector.
         let sizes = [(64, 48), (37, 29), (1, 1), (17, 3)].into_iter();
         for (seed, (width, height)) in (0..).zip(sizes.chain((33..49).map(|width| (width, 19)))) {
@@ -117,7 +123,7 @@ fn compare_models(table: &mut Table, case: &str, found: &Gaussians, expected: &G
 }
 
 /// Typical needs of policies, each with its update cadence.
-fn policy_needs() -> [(&'static str, Needs, Cadence); 7] {
+fn policy_needs() -> [(&'static str, Needs, Cadence); 8] {
     let all = SignalSet::from(Signal::ALL);
     let absolute = SignalSet::from([Signal::ScreenGradientAbs]);
     let pixels = SignalSet::from([Signal::PixelCount, Signal::WeightMax, Signal::ScreenGradient]);
@@ -140,6 +146,11 @@ fn policy_needs() -> [(&'static str, Needs, Cadence); 7] {
         (
             "terms and noise",
             Needs { signals: some, loss_terms, noise: Some(noise), ..Needs::default() },
+            plain,
+        ),
+        (
+            "Huber's function at the pixel",
+            Needs { pixel_loss: PixelLoss::Huber, ..Needs::default() },
             plain,
         ),
         ("bands 1-3 every third step", Needs { cadence: third, ..Needs::default() }, third),

@@ -13,6 +13,7 @@ use densify::selftest::reference::{
     CLASSES, Model, Rules, Upstream, View, blend, differentiate, render,
 };
 use densify::selftest::scenes;
+use densify_policies::policy::PixelLoss;
 
 /// Step of the central difference, to either side.
 const STEP: f64 = 1e-6;
@@ -108,27 +109,35 @@ fn gradients_match_where_the_jacobian_is_clamped() {
 fn the_gradient_of_the_loss_matches() {
     let mut table = Table::new("reference loss against central differences");
     let mut rng = ChaCha8Rng::seed_from_u64(8);
-    for (width, height) in [(1, 1), (1, 17), (17, 1), (7, 5), (14, 12)] {
+    let sizes = [(1, 1), (1, 17), (17, 1), (7, 5), (14, 12)];
+    let all = |size| [PixelLoss::L1, PixelLoss::Huber].map(|pixel_loss| (size, pixel_loss));
+    for ((width, height), pixel_loss) in sizes.into_iter().flat_map(all) {
         let n = 3 * width * height;
         let target: Vec<f64> = (0..n).map(|_| rng.random::<f64>()).collect();
+        // L1 has no derivative at equality.
         let rendered: Vec<f64> = target
             .iter()
             .map(|t| t + rng.random_range(0.01..0.3) * if rng.random() { 1.0 } else { -1.0 })
             .collect();
-        let analytic = loss(&rendered, &target, width, height);
+        let analytic = loss(&rendered, &target, (width, height), pixel_loss);
         let largest = analytic.gradient.iter().fold(0.0_f64, |m, g| m.max(g.abs()));
         let mut moved = rendered.clone();
         let mut worst = 0.0_f64;
         for i in 0..n {
             moved[i] = rendered[i] + STEP;
-            let above = loss(&moved, &target, width, height).smoothed;
+            let above = loss(&moved, &target, (width, height), pixel_loss).minimised;
             moved[i] = rendered[i] - STEP;
-            let below = loss(&moved, &target, width, height).smoothed;
+            let below = loss(&moved, &target, (width, height), pixel_loss).minimised;
             moved[i] = rendered[i];
             let difference = (above - below) / (2.0 * STEP) - analytic.gradient[i];
             worst = worst.max(difference.abs());
         }
-        table.check(&format!("{width}x{height}"), "rendered", worst / largest, TOLERANCE);
+        table.check(
+            &format!("{width}x{height}, {pixel_loss:?}"),
+            "rendered",
+            worst / largest,
+            TOLERANCE,
+        );
     }
     table.finish();
 }

@@ -12,7 +12,7 @@ use densify::selftest::reference::loss::loss;
 use densify::selftest::reference::project::{self, Splat, by_depth};
 use densify::selftest::reference::{CLASSES, Model, Rules, Upstream, View, blend};
 use densify::selftest::{Setup, Subject, scenes};
-use densify_policies::policy::{Needs, Signal, SignalSet};
+use densify_policies::policy::{Needs, PixelLoss, Signal, SignalSet};
 
 use crate::subject::{BLUE, all, make_with, normalised, repeatable, step_input};
 
@@ -177,7 +177,7 @@ fn image_gradient(scene: &Scene) -> Upstream {
     let at = |i: usize| f64::from(mask[i / 3]) / 255.0;
     let compared: Vec<f64> =
         (0..truth.len()).map(|i| truth[i] + at(i) * (image.rgb[i] - truth[i])).collect();
-    let by_colour = loss(&compared, &truth, width, height).gradient;
+    let by_colour = loss(&compared, &truth, (width, height), PixelLoss::L1).gradient;
     let rgb = by_colour.iter().enumerate().map(|(i, g)| at(i) * g).collect();
     Upstream { rgb, ..no_upstream(width * height) }
 }

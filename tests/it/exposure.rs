@@ -11,7 +11,7 @@ use densify::selftest::reference::loss::loss;
 use densify::selftest::reference::{Model, Rules, Upstream, View, differentiate, render};
 use densify::selftest::{Setup, Subject, scenes};
 use densify_policies::policy::{AuxColumn, AuxRequest, Candidate, CandidateRequest, DepthMode};
-use densify_policies::policy::{ErrorMode, Needs};
+use densify_policies::policy::{ErrorMode, Needs, PixelLoss};
 
 use crate::subject::{BLUE, all, make_with, normalised, repeatable, step_input};
 
@@ -110,14 +110,15 @@ fn gradients_match_the_reference_and_central_differences() {
         let image = render(&model, scene.view(), &Rules::STANDARD);
         let (truth, at) = (scene.truth(), numbers(&EXPOSURE));
         let compared = |exposure: &[f64; 12]| {
-            loss(&scene.exposed(&image.rgb, &image.alpha, exposure), &truth, width, height)
+            let exposed = scene.exposed(&image.rgb, &image.alpha, exposure);
+            loss(&exposed, &truth, (width, height), PixelLoss::L1)
         };
         let differences: Vec<f64> = (0..12)
             .map(|i| {
                 let moved = |by: f64| {
                     let mut to = at;
                     to[i] += by;
-                    compared(&to).smoothed
+                    compared(&to).minimised
                 };
                 (moved(STEP) - moved(-STEP)) / (2.0 * STEP)
             })

@@ -7,7 +7,7 @@ use densify::core::image::Image8;
 use densify::render::{LearningRates, StepInput, Storage};
 use densify_policies::plan::EditPlan;
 use densify_policies::policy::{
-    ErrorMap, ErrorScore, Needs, SUPPORT_WEIGHT, Signal, SignalKind, SignalSet,
+    ErrorMap, ErrorScore, Needs, PixelLoss, SUPPORT_WEIGHT, Signal, SignalKind, SignalSet,
 };
 
 use crate::subject::{all, devices, make_with, normalised, repeatable, step_input, storages};
@@ -60,7 +60,8 @@ fn rendering_and_loss(model: &Model, view: View<'_>, target: &Image8) -> (Image,
     let mask = |i: usize| target.mask.as_ref().map_or(1.0, |mask| f64::from(mask[i / 3]) / 255.0);
     let pairs = image.rgb.iter().zip(&truth).enumerate();
     let masked: Vec<f64> = pairs.map(|(i, (x, y))| y + mask(i) * (x - y)).collect();
-    let mut loss = loss(&masked, &truth, view.camera.width as usize, view.camera.height as usize);
+    let size = (view.camera.width as usize, view.camera.height as usize);
+    let mut loss = loss(&masked, &truth, size, PixelLoss::L1);
     for (i, gradient) in loss.gradient.iter_mut().enumerate() {
         *gradient *= mask(i);
     }

@@ -154,8 +154,8 @@ use crate::adc::{
 use crate::parameters::StepParameter::{self, Interval, Step};
 use crate::plan::{EditPlan, Reset};
 use crate::policy::{
-    AuxColumn, AuxRequest, AuxView, Candidate, DensityPolicy, Needs, PolicyResult, SceneInfo,
-    Signal, SignalSet, Snapshot,
+    AuxColumn, AuxRequest, AuxView, Candidate, DensityPolicy, Needs, PixelLoss, PolicyResult,
+    SceneInfo, Signal, SignalSet, Snapshot,
 };
 use crate::quota::event_quota;
 use crate::registry::ConfiguredPolicy;
@@ -252,6 +252,7 @@ impl DensityPolicy for Diet {
             candidates: self.candidate_request(scene),
             full_depth: self.scene_units(self.params.full_depth, scene),
             aux: self.aux_request(scene),
+            pixel_loss: PixelLoss::Huber,
             ..Needs::default()
         }
     }

@@ -76,7 +76,9 @@ use crate::adc::{
 };
 use crate::parameters::StepParameter::{self, Interval, Step};
 use crate::plan::{EditPlan, Offspring, Reset};
-use crate::policy::{DensityPolicy, Needs, PolicyResult, SceneInfo, Signal, SignalSet, Snapshot};
+use crate::policy::{
+    DensityPolicy, Needs, PixelLoss, PolicyResult, SceneInfo, Signal, SignalSet, Snapshot,
+};
 use crate::registry::ConfiguredPolicy;
 use crate::rng::PolicyRng;
 use crate::sample::{largest, smallest};
@@ -135,7 +137,7 @@ impl DensityPolicy for Merit {
             }
         }
         let full_depth = (self.params.full_depth * f64::from(scene.extent)) as f32;
-        Needs { signals, full_depth, ..Needs::default() }
+        Needs { signals, full_depth, pixel_loss: PixelLoss::Huber, ..Needs::default() }
     }
 
     fn is_due(&self, step: u32) -> bool {

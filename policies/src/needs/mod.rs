@@ -14,7 +14,7 @@ pub use pixels::{
     AuxRequest, CandidateRequest, DepthMode, ErrorMap, ErrorMode, ErrorScore, PixelMap,
 };
 pub use rates::{Cadence, Fade, Rate, RateOverrides};
-pub use terms::{LossTerms, MaskTerm, NoiseTerm};
+pub use terms::{LossTerms, MaskTerm, NoiseTerm, PixelLoss};
 
 /// The inputs of a policy, and its changes to initialisation and training.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -34,6 +34,8 @@ pub struct Needs {
     pub candidates: Option<CandidateRequest>,
     /// Measurements in [auxiliary views](crate::policy::DensityPolicy::observe), if any.
     pub aux: Option<AuxRequest>,
+    /// The pixel term of the image loss. With [`PixelLoss::Huber`], short runs also take larger steps.
+    pub pixel_loss: PixelLoss,
     /// Terms added to the training loss; the policy may [vary](crate::policy::DensityPolicy::loss_terms) them
     /// by step.
     pub loss_terms: LossTerms,

@@ -4,6 +4,30 @@ use serde::{Deserialize, Serialize};
 
 use super::{above_zero, at_least};
 
+/// The pixel term ρ of the image loss 0.8·ρ + 0.2·(1 − SSIM), a mean over pixels and channels of their differences e. It
+/// decides the gradient; losses are reported with L1, as other trainers report them.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum PixelLoss {
+    /// |e| (Kerbl et al. 2023, section 5.1).
+    #[default]
+    L1,
+    /// Huber's function (1964): e²/(2δ) up to δ = 0.1, |e| − δ/2 beyond. The gradient of |e| is as large for a pixel that
+    /// is almost right as for a wrong one, and keeps moving Gaussians that fit well. Gradients of positions on screen are
+    /// smaller with it, so policies with published thresholds for these use L1.
+    Huber,
+}
+
+impl PixelLoss {
+    /// The difference δ from which the gradient no longer grows; 0 for L1.
+    pub fn bound(self) -> f32 {
+        match self {
+            Self::L1 => 0.0,
+            Self::Huber => 0.1,
+        }
+    }
+}
+
 /// Coefficients of terms added to the image loss; 0 switches a term off, at no cost.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct LossTerms {

@@ -2,7 +2,7 @@
 
 use densify_policies::policy::{
     AuxRequest, Cadence, CandidateRequest, ErrorScore, LossTerms, MaskTerm, Needs, NoiseTerm,
-    RateOverrides, Signal, SignalSet, StartRule,
+    PixelLoss, RateOverrides, Signal, SignalSet, StartRule,
 };
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
@@ -24,6 +24,7 @@ struct Declared {
     error_score: Option<ErrorScore>,
     candidates: Option<CandidateRequest>,
     aux: Option<AuxRequest>,
+    pixel_loss: PixelLoss,
     loss_terms: Option<LossTerms>,
     noise: Option<NoiseTerm>,
     mask: Option<MaskTerm>,
@@ -61,6 +62,7 @@ pub(super) fn parse(json: &str) -> PyResult<Needs> {
         error_score: declared.error_score.unwrap_or_default(),
         candidates: declared.candidates,
         aux: declared.aux,
+        pixel_loss: declared.pixel_loss,
         loss_terms: declared.loss_terms.unwrap_or_default(),
         noise: declared.noise,
         mask: declared.mask,

@@ -194,7 +194,7 @@ impl CpuBackend {
             lists: TileLists::new(rows, cap),
             canvas: Vec::new(),
             gradient: Vec::new(),
-            loss: LossBuffers::new(),
+            loss: LossBuffers::new(options.needs.pixel_loss),
             records: bytemuck::zeroed_vec(record_cap * stride),
             record_cap,
             sums: vec![0.0; budget::summed_rows(options) * sum_width],

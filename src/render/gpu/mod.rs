@@ -222,11 +222,12 @@ fn launches(
     (shortcuts, antialiasing): (Shortcuts, Antialiasing),
     buffers: &Buffers,
 ) -> Result<Launches, BackendError> {
-    let &Sizes { records, alpha_and_depth, depth, counts_dominant, .. } = sizes;
+    let &Sizes { records, alpha_and_depth, depth, counts_dominant, pixel_loss, .. } = sizes;
     let variant = Variant {
         records,
         alpha_and_depth,
         depth,
+        pixel_loss,
         shortcuts,
         formats: sizes.formats(),
         counts_dominant,

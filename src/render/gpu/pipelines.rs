@@ -3,7 +3,7 @@
 use std::collections::HashMap;
 use std::sync::Arc;
 
-use densify_policies::policy::{SUPPORT_WEIGHT, Signal};
+use densify_policies::policy::{PixelLoss, SUPPORT_WEIGHT, Signal};
 use wgpu::{ComputePipeline, Device, ShaderModule};
 
 use super::kernels::{Binding, Kernel, kernels, parse};
@@ -20,6 +20,7 @@ pub(super) struct Variant {
     pub(super) alpha_and_depth: bool,
     /// True if depth may be in the loss.
     pub(super) depth: bool,
+    pub(super) pixel_loss: PixelLoss,
     pub(super) shortcuts: Shortcuts,
     pub(super) formats: Formats,
     /// True if the pixels that each row dominates are counted.
@@ -34,6 +35,7 @@ impl Variant {
             ("RECORD".to_owned(), self.records.stride() as f64),
             ("MORE".to_owned(), f64::from(u8::from(self.alpha_and_depth))),
             ("DEPTH_IN_LOSS".to_owned(), f64::from(u8::from(self.depth))),
+            ("PIXEL_BOUND".to_owned(), f64::from(self.pixel_loss.bound())),
             ("COUNTS_DOMINANT".to_owned(), f64::from(u8::from(self.counts_dominant))),
             ("BLUR".to_owned(), f64::from(self.antialiasing.kernel())),
             ("LOWERS_OPACITY".to_owned(), f64::from(u8::from(self.antialiasing.is_on()))),

@@ -1,6 +1,6 @@
 //! Sizes of all buffers, known before the first is allocated. The ledger lists them.
 
-use densify_policies::policy::{Cadence, ErrorMode, Needs};
+use densify_policies::policy::{Cadence, ErrorMode, Needs, PixelLoss};
 use wgpu::BufferUsages;
 
 use super::exposure;
@@ -66,6 +66,8 @@ pub(super) struct Sizes {
     pub(super) cadence: Cadence,
     /// True if the pixels that each row dominates are counted.
     pub(super) counts_dominant: bool,
+    /// Pixel term of the loss.
+    pub(super) pixel_loss: PixelLoss,
     /// True if rows have masks.
     pub(super) with_masks: bool,
     /// True if the loss writes an error per pixel for candidates besides the one for row scores.
@@ -129,6 +131,7 @@ impl Sizes {
             alpha_and_depth: false,
             cadence: needs.cadence,
             counts_dominant: counts_dominant(needs),
+            pixel_loss: needs.pixel_loss,
             with_masks: needs.mask.is_some(),
             with_edges: records.has(Field::Error) && needs.error_score.edge > 0.0,
             with_error: records.has(Field::Error)

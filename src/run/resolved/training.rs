@@ -30,7 +30,11 @@ impl ResolvedTraining {
         let scene = case.scene(size.rows, initial_rows)?;
         let policy = choices.entry.build(&choices.parameters, &scene)?;
         let declared = policy.needs(&scene);
-        let rates = case.spec.learning_rates(&declared.rates, choices.position_rates.factor)?;
+        let rates = case.spec.learning_rates(
+            &declared.rates,
+            declared.pixel_loss,
+            choices.position_rates.factor,
+        )?;
         let parameters = choices.entry.effective(&choices.parameters, &scene)?;
         Ok(Self { policy, scene, declared, parameters, rates })
     }

@@ -3,7 +3,7 @@
 
 use std::path::{Path, PathBuf};
 
-use densify_policies::policy::RateOverrides;
+use densify_policies::policy::{PixelLoss, RateOverrides};
 use densify_policies::registry::{PolicyEntry, find, import};
 use toml::{Table, Value};
 
@@ -136,7 +136,7 @@ impl RunSpec {
         Knobs::from_table(&table).map_err(|error| OptionProblem::value("knob", error).into())
     }
 
-    /// The learning rates: the defaults for a run of this length, overlaid with `policy_rates`. The rates of positions
+    /// The learning rates: the defaults for a run of this length and pixel term, overlaid with `policy_rates`. The rates of positions
     /// are then multiplied by `position_factor`. If the run starts from a model, the rates are
     /// [fine](RateOptions::fine), except with `--init-rates full`. `--lr` is overlaid last.
     ///
@@ -145,14 +145,16 @@ impl RunSpec {
     pub(crate) fn learning_rates(
         &self,
         policy_rates: &RateOverrides,
+        pixel_loss: PixelLoss,
         position_factor: f64,
     ) -> Result<RateOptions, Failure> {
         let fail = |problem: &str| Failure::from(OptionProblem::value("lr", problem.trim()));
         let iterations = self.schedule.iterations.0;
         let is_model = matches!(self.start.init, Some(InitChoice::Model(_)));
         let is_fine = is_model && self.start.init_rates == InitRates::Fine;
-        let defaults = if is_fine { RateOptions::for_trained_model } else { RateOptions::for_run };
-        let mut defaults = defaults(iterations).with(policy_rates);
+        // Models that are trained already keep the published rates of their end.
+        let pixel_loss = if is_fine { PixelLoss::L1 } else { pixel_loss };
+        let mut defaults = RateOptions::for_run(iterations, pixel_loss).with(policy_rates);
         defaults.mean_start *= position_factor;
         defaults.mean_end *= position_factor;
         defaults.noise_end = defaults.noise_end.map(|end| end * position_factor);
@@ -262,7 +264,7 @@ mod tests {
         let rates = |lr: &str, policy_rates: &RateOverrides| {
             let mut spec = spec("lr", lr).unwrap();
             spec.schedule.iterations.0 = 30_000;
-            spec.learning_rates(policy_rates, 1.0).unwrap()
+            spec.learning_rates(policy_rates, PixelLoss::L1, 1.0).unwrap()
         };
         let given = rates("{ opacity = 0.05, mean_end = 1e-5 }", &RateOverrides::default());
         let expected = RateOptions { opacity: 0.05, mean_end: 1e-5, ..RateOptions::default() };

@@ -10,7 +10,7 @@ use super::{OPTIONS, RunOption, RunSpec};
 use crate::failure::{Failure, OptionProblem};
 use densify_core::files;
 use densify_policies::parameters::{nearest, parse_value};
-use densify_policies::policy::RateOverrides;
+use densify_policies::policy::{PixelLoss, RateOverrides};
 
 /// Keys of a run's `config.toml` that are not options: the version and the findings.
 pub(crate) const NOT_OPTIONS: [&str; 2] = ["densify", "resolved"];
@@ -186,7 +186,7 @@ fn join(upper: Table, lower: &mut Table) {
 /// Checks the names in options that have several members: knobs, learning rates, settings of policies.
 fn check_names(spec: &RunSpec) -> Result<(), Failure> {
     spec.knobs()?;
-    spec.learning_rates(&RateOverrides::default(), 1.0)?;
+    spec.learning_rates(&RateOverrides::default(), PixelLoss::L1, 1.0)?;
     for setting in &spec.density.policy_set {
         if setting.path.len() != 2 {
             let name = setting.path.join(".");

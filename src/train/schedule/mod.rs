@@ -8,7 +8,7 @@
 use std::fmt;
 use std::str::FromStr;
 
-use densify_policies::policy::RateOverrides;
+use densify_policies::policy::{PixelLoss, RateOverrides};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
@@ -91,37 +91,33 @@ impl RateOptions {
     };
 
     /// The default step sizes of a run. With s = 30,000 / iterations, at least 1, runs of fewer than 30,000 iterations
-    /// start with s^0.6 times the published step sizes, at most 5 times. The means end with s^0.77 times the published
-    /// step size, at most 10 times; log-scales and colour bands 1–3 keep a factor of min(s^0.6, 2) to the end. Noise ends
-    /// as published.
+    /// start with s^0.6 times the published step sizes, at most 5 times; colour bands 1–3 keep a factor of min(s^0.6, 2)
+    /// to the end. With [`PixelLoss::Huber`], log-scales keep that factor too, and the means end with s^0.77 times the
+    /// published step size, at most 10 times; noise ends as published.
     ///
     /// Short runs must reach the same result in fewer steps. With the published step sizes, Gaussians stayed far from
     /// their optimum, with training views as blurred as test views, and view-dependent colour, which has the smallest
     /// steps and starts last, lagged behind. The factors are those with which half of the iterations reach the scores of
     /// the earlier rules (`docs/studies/short-runs.tsv`). With a larger boost, training diverges on photographs.
-    pub fn for_run(iterations: u32) -> Self {
+    pub fn for_run(iterations: u32, pixel_loss: PixelLoss) -> Self {
         let shortage = f64::from(REFERENCE_ITERATIONS) / f64::from(iterations.max(1));
         let boost = shortage.powf(0.6).clamp(1.0, 5.0);
         let published = Self::PUBLISHED;
         let kept = boost.min(2.0) as f32;
-        Self {
-            boost,
-            mean_end: published.mean_end * shortage.powf(0.77).clamp(1.0, 10.0),
-            noise_end: (shortage > 1.0).then_some(published.mean_end),
-            log_scale: published.log_scale * kept,
-            sh_rest: published.sh_rest * kept,
-            ..published
+        let rates = Self { boost, sh_rest: published.sh_rest * kept, ..published };
+        match pixel_loss {
+            PixelLoss::L1 => rates,
+            PixelLoss::Huber => Self {
+                mean_end: published.mean_end * shortage.powf(0.77).clamp(1.0, 10.0),
+                noise_end: (shortage > 1.0).then_some(published.mean_end),
+                log_scale: published.log_scale * kept,
+                ..rates
+            },
         }
     }
 
-    /// The default step sizes of a run that refines a trained model, before they are made [fine](Self::fine): the
-    /// published ones, since larger steps would cost such models 4 to 6 dB at first. Only the step size of colour bands
-    /// 1–3 is that of [`for_run`](Self::for_run).
-    pub fn for_trained_model(iterations: u32) -> Self {
-        Self { sh_rest: Self::for_run(iterations).sh_rest, ..Self::PUBLISHED }
-    }
-
-    /// These step sizes with the final ones in the whole run.
+    /// These step sizes with the final ones in the whole run, for models that are trained already: larger steps would
+    /// cost such models 4 to 6 dB at first.
     #[must_use]
     pub fn fine(self) -> Self {
         Self {

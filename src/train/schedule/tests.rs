@@ -1,15 +1,17 @@
 //! Tests of step sizes, degrees, view orders and backgrounds.
 
-use densify_policies::policy::{Fade, Rate};
+use densify_policies::policy::{Fade, PixelLoss, Rate};
 
 use super::*;
 
 #[test]
 fn short_runs_have_larger_step_sizes() {
     let published = RateOptions::default();
-    assert_eq!(RateOptions::for_run(30_000), published);
-    assert_eq!(RateOptions::for_run(100_000), published);
-    let short = RateOptions::for_run(3_000);
+    for pixel_loss in [PixelLoss::L1, PixelLoss::Huber] {
+        assert_eq!(RateOptions::for_run(30_000, pixel_loss), published);
+        assert_eq!(RateOptions::for_run(100_000, pixel_loss), published);
+    }
+    let short = RateOptions::for_run(3_000, PixelLoss::Huber);
     let close = |a: f32, b: f32| assert!((a / b - 1.0).abs() < 1e-5, "{a} against {b}");
     let (start, end) = (short.at(0, 3_000, 1.0), short.at(3_000, 3_000, 1.0));
     let factor = 10_f32.powf(0.6);
@@ -25,12 +27,17 @@ fn short_runs_have_larger_step_sizes() {
     close(end.sh_rest, 2.0 * published.sh_rest);
     // A slightly shorter run has slightly larger step sizes.
     let factor = 1.25_f32.powf(0.6);
-    close(RateOptions::for_run(24_000).sh_rest, published.sh_rest * factor);
-    close(RateOptions::for_run(1).boost as f32, 5.0);
-    close(RateOptions::for_run(1).mean_end as f32, 1.6e-5);
-    // A trained model is refined with the published step sizes.
-    let refined = RateOptions::for_trained_model(3_000);
-    assert_eq!(refined, RateOptions { sh_rest: short.sh_rest, ..published });
+    let slightly_shorter = RateOptions::for_run(24_000, PixelLoss::Huber);
+    close(slightly_shorter.sh_rest, published.sh_rest * factor);
+    let shortest = RateOptions::for_run(1, PixelLoss::Huber);
+    close(shortest.boost as f32, 5.0);
+    close(shortest.mean_end as f32, 1.6e-5);
+    // With L1, means and log-scales end with the published step sizes.
+    let (boost, sh_rest) = (short.boost, short.sh_rest);
+    assert_eq!(
+        RateOptions::for_run(3_000, PixelLoss::L1),
+        RateOptions { boost, sh_rest, ..published }
+    );
 }
 
 #[test]
@@ -198,9 +205,9 @@ fn fine_step_sizes_are_the_final_ones_throughout() {
         opacity_end: Some(3e-3),
         sh_dc_end: Some(4e-4),
         sh_rest_end: Some(5e-5),
-        ..RateOptions::for_run(2_000)
+        ..RateOptions::for_run(2_000, PixelLoss::L1)
     };
-    for rates in [RateOptions::for_run(2_000), with_ends] {
+    for rates in [RateOptions::for_run(2_000, PixelLoss::L1), with_ends] {
         let end = rates.at(2_000, 2_000, 3.0);
         for step in [1, 700, 2_000] {
             let fine = rates.fine().at(step, 2_000, 3.0);

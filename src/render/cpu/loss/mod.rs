@@ -1,6 +1,6 @@
 //! Stage 4: the image loss 0.8·L1 + 0.2·(1 − SSIM) (Kerbl et al. 2023, section 5.1; SSIM of Wang et al. 2004 with an
-//! 11×11 Gaussian window of σ = 1.5 and zero padding), and the gradient that training follows. The gradient is that of
-//! the same loss with Huber's function (1964) in place of |e|: e²/(2δ) up to δ = [`HUBER`], |e| − δ/2 beyond.
+//! 11×11 Gaussian window of σ = 1.5 and zero padding), and the gradient that training follows: that of the loss with the
+//! [pixel term](PixelLoss) of the policy in place of L1.
 //!
 //! SSIM is written in terms of the difference e = x − y of rendering x and target y, by an exact identity:
 //! SSIM = (1 − μₑ²/A)·(1 − Var(e)/B), A = μₓ² + μᵧ² + C₁, B = Var(x) + Var(y) + C₂.
@@ -21,7 +21,7 @@
 mod pixel_weights;
 mod window;
 
-use densify_policies::policy::ErrorScore;
+use densify_policies::policy::{ErrorScore, PixelLoss};
 use pulp::{Arch, Simd, WithSimd};
 use rayon::prelude::*;
 
@@ -42,9 +42,8 @@ const C1: f32 = 0.01 * 0.01;
 const C2: f32 = 0.03 * 0.03;
 /// Weight of 1 − SSIM; L1 has the rest.
 pub(crate) const SSIM_WEIGHT: f32 = 0.2;
-/// The pixel difference from which the gradient no longer grows. The gradient of |e| is as large for a pixel that is
-/// almost right as for a wrong one, and keeps moving Gaussians that fit well.
-pub(crate) const HUBER: f32 = 0.1;
+/// Stands for the bound 0 of L1: smaller than any difference of colours, and a power of two, so that scaling is exact.
+const LEAST_BOUND: f32 = 1.0 / (1_u64 << 40) as f32;
 /// The constant subtracted from y.
 const MIDDLE: f32 = 0.5;
 /// Image rows per strip in passes that write whole tiles.
@@ -66,6 +65,7 @@ pub(super) struct LossBuffers {
     errors: [Vec<[f32; WIDTH]>; 2],
     segments: Segments,
     weights: PixelWeights,
+    pixel_loss: PixelLoss,
 }
 
 /// The pixel errors requested from a loss.
@@ -106,8 +106,9 @@ impl LossBuffers {
         ((planes + lines) * size_of::<f32>()) as u64 + weights
     }
 
-    pub(super) fn new() -> Self {
+    pub(super) fn new(pixel_loss: PixelLoss) -> Self {
         Self {
+            pixel_loss,
             planes: Default::default(),
             errors: Default::default(),
             segments: Segments::new(0),
@@ -152,6 +153,7 @@ impl LossBuffers {
         let vectors = self.resize(grid, requested);
         let Self { planes, errors, segments, .. } = self;
         let segments = *segments;
+        let bound = self.pixel_loss.bound().max(LEAST_BOUND);
         let [e, y, p1, p2, p3] = planes.each_mut().map(|plane| &mut plane[..vectors]);
         let [candidate_errors, row_errors] = errors;
         // Empty unless requested.
@@ -212,6 +214,7 @@ impl LossBuffers {
                     y,
                     derivatives: [p1, p2, p3],
                     scale: 1.0 / samples as f32,
+                    bound,
                     mask: target.mask.as_deref(),
                     tiles,
                 });
@@ -498,6 +501,8 @@ struct Gradient<'a> {
     derivatives: [&'a Line; 3],
     /// 1 / number of samples.
     scale: f32,
+    /// The pixel difference from which the gradient no longer grows, > 0.
+    bound: f32,
     mask: Option<&'a [u8]>,
     /// The strip's tiles.
     tiles: &'a mut [TileGradient],
@@ -509,12 +514,12 @@ impl WithSimd for Gradient<'_> {
     #[inline(always)]
     fn with_simd<S: Simd>(self, s: S) {
         let Self { grid, segments, channel, first, scratch, e, y, derivatives, scale, .. } = self;
-        let Self { mask, tiles, .. } = self;
+        let Self { bound, mask, tiles, .. } = self;
         let rows = STRIP.min(grid.height - first);
         let ([zeros, out, pixels], mut lines) = scratch_lines::<3, 3>(scratch, segments);
         zeros.fill([0.0; WIDTH]);
         let pixels = pixels.as_flattened_mut();
-        let pixel_scale = (1.0 - SSIM_WEIGHT) / HUBER * scale;
+        let pixel_scale = (1.0 - SSIM_WEIGHT) * scale / bound;
         let ssim_scale = -SSIM_WEIGHT * scale;
         if rows < STRIP {
             for tile in tiles.iter_mut() {
@@ -542,8 +547,8 @@ impl WithSimd for Gradient<'_> {
                     for n in 0..TOGETHER {
                         let (e, y) = (V::load(s, &e[n][lane..]), V::load(s, &y[n][lane..]));
                         let by_ssim = by_mu_e[n] + e * 2.0 * by_ee[n] + y * by_ey[n];
-                        let bounded = e.min(V::splat(s, HUBER)).max(V::splat(s, -HUBER));
-                        let g = by_ssim.mul_add(V::splat(s, ssim_scale), bounded * pixel_scale);
+                        let bounded = e.min(V::splat(s, bound)).max(V::splat(s, -bound));
+                        let g = by_ssim * ssim_scale + bounded * pixel_scale;
                         g.store(&mut out[n][lane..]);
                     }
                 }

@@ -7,7 +7,7 @@ use super::*;
 
 /// The scalars, dL/dpixel and each pixel's error for a rendering and a target with different patterns.
 fn run(requests: ErrorRequests, mask: bool) -> (LossValue, Vec<f32>, Vec<f32>) {
-    run_in(&mut LossBuffers::new(), [37, 50], requests, mask)
+    run_in(&mut LossBuffers::new(PixelLoss::Huber), [37, 50], requests, mask)
 }
 
 fn run_in(
@@ -73,9 +73,13 @@ fn reused_buffers_give_the_same_results_as_new_ones() {
         assert!(errors.iter().any(|error| *error > 0.0));
         (loss, errors)
     };
-    let mut buffers = LossBuffers::new();
+    let mut buffers = LossBuffers::new(PixelLoss::Huber);
     for size in [[37, 50], [60, 20], [37, 50], [100, 70]] {
-        assert_eq!(both(&mut buffers, size), both(&mut LossBuffers::new(), size), "{size:?}");
+        assert_eq!(
+            both(&mut buffers, size),
+            both(&mut LossBuffers::new(PixelLoss::Huber), size),
+            "{size:?}"
+        );
         run_in(&mut buffers, [50, 90], ErrorRequests::default(), true);
     }
 }

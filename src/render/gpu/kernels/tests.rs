@@ -7,7 +7,8 @@ use wgpu::naga::valid::{Capabilities, ValidationFlags, Validator};
 use wgpu::naga::{AddressSpace, StructMember, TypeInner};
 
 use densify_policies::policy::{
-    Cadence, CandidateRequest, DepthMode, ErrorMode, ErrorScore, Needs, Signal, SignalSet,
+    Cadence, CandidateRequest, DepthMode, ErrorMode, ErrorScore, Needs, PixelLoss, Signal,
+    SignalSet,
 };
 
 use super::super::adapter::features_for;
@@ -91,6 +92,7 @@ fn every_override_has_a_value_and_every_signal_a_number() {
         records: RecordLayout::DIFFERENTIATED,
         alpha_and_depth: true,
         depth: true,
+        pixel_loss: PixelLoss::Huber,
         shortcuts: Shortcuts::default(),
         antialiasing: Antialiasing::Wide,
         formats: SLOTS,

@@ -12,7 +12,8 @@ use crate::values::SIZES;
 use densify_core::camera::Camera;
 use densify_core::gaussians::Gaussians;
 use densify_core::image::Image8;
-use densify_render::{BackendError, Differentiable};
+use densify_policies::policy::{Needs, PixelLoss};
+use densify_render::{BackendError, Differentiable, Setup};
 
 /// Size of the images `[px]`, except those of [`SIZES`].
 const SIZE: (u32, u32) = (48, 40);
@@ -33,7 +34,12 @@ fn flat_image(value: u8) -> Image8 {
 }
 
 /// The reference's loss, with the target composited over the background and the error weighted by the mask.
-fn expected(rendered: &[f32], target: &Image8, background: [f32; 3]) -> Loss {
+fn expected(
+    rendered: &[f32],
+    target: &Image8,
+    background: [f32; 3],
+    pixel_loss: PixelLoss,
+) -> Loss {
     let weight = |plane: &Option<Vec<u8>>, p: usize| {
         plane.as_ref().map_or(1.0, |plane| f64::from(plane[p]) / 255.0)
     };
@@ -45,7 +51,8 @@ fn expected(rendered: &[f32], target: &Image8, background: [f32; 3]) -> Loss {
     let masked =
         |i: usize| truth[i] + weight(&target.mask, i / 3) * (f64::from(rendered[i]) - truth[i]);
     let masked: Vec<f64> = (0..rendered.len()).map(masked).collect();
-    let mut loss = loss(&masked, &truth, target.width as usize, target.height as usize);
+    let size = (target.width as usize, target.height as usize);
+    let mut loss = loss(&masked, &truth, size, pixel_loss);
     for (i, gradient) in loss.gradient.iter_mut().enumerate() {
         *gradient *= weight(&target.mask, i / 3);
     }
@@ -54,13 +61,13 @@ fn expected(rendered: &[f32], target: &Image8, background: [f32; 3]) -> Loss {
 
 fn check(
     trial: &mut Trial<'_>,
-    backend: &mut dyn Differentiable,
+    (backend, pixel_loss): (&mut dyn Differentiable, PixelLoss),
     label: &str,
     rendered: &[f32],
     target: &Image8,
 ) -> Result<(), BackendError> {
     let background = [0.1, 0.5, 0.9];
-    let expected = expected(rendered, target, background);
+    let expected = expected(rendered, target, background, pixel_loss);
     let (found, gradient) = backend.loss(&scenes::opaque(rendered, target), target, background)?;
     let (value_tolerance, gradient_tolerance) = tolerances(trial.subject);
     for (quantity, found, expected) in [
@@ -86,7 +93,7 @@ pub(super) fn uniform_photographs(trial: &mut Trial<'_>) -> Result<(), BackendEr
         ("grey", flat_image(128)),
         ("transparent", transparent),
     ] {
-        check(trial, &mut *backend, label, &noisy, &target)?;
+        check(trial, (&mut *backend, PixelLoss::L1), label, &noisy, &target)?;
     }
     for value in [0, 1, 153, 255] {
         let (label, target) = (format!("equal to {value}"), flat_image(value));
@@ -116,12 +123,17 @@ pub(super) fn uniform_photographs(trial: &mut Trial<'_>) -> Result<(), BackendEr
 
 pub(super) fn flat_and_similar(trial: &mut Trial<'_>) -> Result<(), BackendError> {
     let mut backend = trial.subject.backend(&Gaussians::default())?;
+    let needs = Needs { pixel_loss: PixelLoss::Huber, ..Needs::default() };
+    let setup = Setup { needs, ..Setup::default() };
+    let mut huber = trial.subject.backend_with(&Gaussians::default(), setup)?;
     // The reference's loss is too slow for the longest image.
     for (seed, size) in SIZES.into_iter().filter(|size| size.1 < 1000).enumerate() {
         for noise in [0.05, 1.0] {
             let (rendered, target) = scenes::noisy(size, noise, seed as u64);
             let label = format!("{}x{}, noise {noise}", size.0, size.1);
-            check(trial, &mut *backend, &label, &rendered, &target)?;
+            check(trial, (&mut *backend, PixelLoss::L1), &label, &rendered, &target)?;
+            let label = format!("{label}, Huber");
+            check(trial, (&mut *huber, PixelLoss::Huber), &label, &rendered, &target)?;
         }
     }
     let (rendered, target) = scenes::noisy(SIZE, 0.3, 77);
@@ -135,7 +147,7 @@ pub(super) fn flat_and_similar(trial: &mut Trial<'_>) -> Result<(), BackendError
         ("coverage and mask", Some(&ramp), Some(&half)),
     ] {
         let target = Image8 { alpha: alpha.cloned(), mask: mask.cloned(), ..target.clone() };
-        check(trial, &mut *backend, label, &rendered, &target)?;
+        check(trial, (&mut *backend, PixelLoss::L1), label, &rendered, &target)?;
     }
     let n = target.rgb.len();
     let mut rng = ChaCha8Rng::seed_from_u64(24);
@@ -146,7 +158,7 @@ pub(super) fn flat_and_similar(trial: &mut Trial<'_>) -> Result<(), BackendError
         ("black on white", vec![0.0; n], 255),
         ("beyond 1", vec![1.2; n], 255),
     ] {
-        check(trial, &mut *backend, label, &rendered, &flat_image(value))?;
+        check(trial, (&mut *backend, PixelLoss::L1), label, &rendered, &flat_image(value))?;
     }
     // Almost equal: SSIM stays at 1.
     let target = flat_image(153);

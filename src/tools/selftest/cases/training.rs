@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use densify_policies::policy::SceneInfo;
+use densify_policies::policy::{PixelLoss, SceneInfo};
 use densify_policies::registry::find;
 use glam::{DMat3, DVec3};
 
@@ -134,7 +134,7 @@ fn train(trial: &mut Trial<'_>, name: &str) -> Result<(), Box<dyn std::error::Er
         seed: 5,
         sh_degree: 3,
         background: Background::Black,
-        rates: RateOptions::for_run(iterations),
+        rates: RateOptions::for_run(iterations, PixelLoss::L1),
         prefetch: 1,
         frozen: 0,
         has_all_bands: false,

@@ -1,11 +1,11 @@
 //! The training loss, 0.8 · L1 + 0.2 · (1 − SSIM), and the gradient that training follows, straight from the definition.
 
+use densify_policies::policy::PixelLoss;
+
 /// Radius of the 11×11 window `[px]`.
 const REACH: i64 = 5;
 const C1: f64 = 0.0001;
 const C2: f64 = 0.0009;
-/// The difference from which Huber's function is linear.
-const HUBER: f64 = 0.1;
 
 /// The loss, its parts, and its gradient.
 #[derive(Debug, Clone)]
@@ -16,9 +16,9 @@ pub struct Loss {
     pub l1: f64,
     /// Mean SSIM.
     pub ssim: f64,
-    /// The loss with the mean of Huber's function in place of L1, which training minimises.
-    pub smoothed: f64,
-    /// Gradient of `smoothed` with respect to the rendering. Shape: [height, width, 3].
+    /// The loss with the pixel term in place of L1, which training minimises.
+    pub minimised: f64,
+    /// Gradient of `minimised` with respect to the rendering. Shape: [height, width, 3].
     pub gradient: Vec<f64>,
     /// Absolute error and 1 − SSIM of each pixel, means over channels.
     pub by_pixel: Vec<[f64; 2]>,
@@ -57,7 +57,12 @@ fn product(a: &[f64], b: &[f64]) -> Vec<f64> {
 }
 
 /// The loss of `rendered` against `target`: [height, width, 3], not clamped.
-pub fn loss(rendered: &[f64], target: &[f64], width: usize, height: usize) -> Loss {
+pub fn loss(
+    rendered: &[f64],
+    target: &[f64],
+    (width, height): (usize, usize),
+    pixel_loss: PixelLoss,
+) -> Loss {
     let n = rendered.len() as f64;
     let blurred = |image: &[f64]| blur(image, width, height);
     let (mx, my) = (blurred(rendered), blurred(target));
@@ -84,19 +89,24 @@ pub fn loss(rendered: &[f64], target: &[f64], width: usize, height: usize) -> Lo
     }
     ssim /= n;
     let (d_mx, d_xx, d_xy) = (blurred(&d_mx), blurred(&d_xx), blurred(&d_xy));
-    let (mut l1, mut huber) = (0.0, 0.0);
+    let (mut l1, mut term) = (0.0, 0.0);
+    let bound = f64::from(pixel_loss.bound());
     let gradient = (0..rendered.len())
         .map(|i| {
             let error = rendered[i] - target[i];
             l1 += error.abs();
-            let near = error.abs().min(HUBER);
-            huber += near * (error.abs() - near / 2.0) / HUBER;
-            let by_pixel = (error / HUBER).clamp(-1.0, 1.0);
+            let size = error.abs();
+            let (value, by_pixel) = if size < bound {
+                (size * size / (2.0 * bound), error / bound)
+            } else {
+                (size - bound / 2.0, if error == 0.0 { 0.0 } else { error.signum() })
+            };
+            term += value;
             let d_ssim = d_mx[i] + 2.0 * rendered[i] * d_xx[i] + target[i] * d_xy[i];
             (0.8 * by_pixel - 0.2 * d_ssim) / n
         })
         .collect();
     l1 /= n;
     let with = |pixels: f64| 0.8 * pixels + 0.2 * (1.0 - ssim);
-    Loss { loss: with(l1), l1, ssim, smoothed: with(huber / n), gradient, by_pixel }
+    Loss { loss: with(l1), l1, ssim, minimised: with(term / n), gradient, by_pixel }
 }
