@@ -43,7 +43,8 @@
 //! Each event is one plan in which Gaussians are pruned before new ones take their places, so the budget holds
 //! at all times. The published code exceeds it between insertion and the next pruning; this is not
 //! reproduced. Opacities are never reset. The published settings also use a learning rate of 0.025 for
-//! opacities (`--lr opacity=0.025`).
+//! opacities (`--lr opacity=0.025`), and L1 as the pixel term of the loss, where this policy uses Huber's
+//! function (docs/studies/short-runs.tsv).
 //!
 //! ## Choices
 //!

@@ -83,8 +83,8 @@ use crate::plan::{
     EditPlan, NO_ROTATION, Offspring, OpacityRule, ParentFate, Placement, ScaleRule,
 };
 use crate::policy::{
-    DensityPolicy, LossTerms, Needs, NoiseTerm, PixelLoss, PolicyResult, Rate, RateOverrides,
-    SceneInfo, Signal, SignalSet, Snapshot, StartRule,
+    DensityPolicy, LossTerms, Needs, NoiseTerm, PolicyResult, Rate, RateOverrides, SceneInfo,
+    Signal, SignalSet, Snapshot, StartRule,
 };
 use crate::registry::ConfiguredPolicy;
 use crate::rng::PolicyRng;
@@ -198,7 +198,6 @@ impl DensityPolicy for Mcmc {
         };
         Needs {
             signals: SignalSet::from([Signal::Opacity]),
-            pixel_loss: PixelLoss::Huber,
             loss_terms: LossTerms {
                 opacity: params.opacity_term as f32,
                 scale: (params.scale_term / radius) as f32,

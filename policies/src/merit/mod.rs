@@ -38,7 +38,8 @@
 //! their opacity `child_opacity` times the parent's. A smaller one is cloned in place.
 //!
 //! Each event is one plan that prunes before it grows, so the budget holds at all times. Opacities are
-//! never reset, the loss has no additional terms, and learning rates are the trainer's.
+//! never reset, the pixel term of the loss is Huber's function, the loss has no additional terms, and learning
+//! rates are the trainer's.
 //!
 //! ## Parameters
 //!
