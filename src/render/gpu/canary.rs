@@ -138,8 +138,8 @@ impl GpuBackend {
 }
 
 impl GpuDevice {
-    /// Compares the device with the native backend, once per set of kernels that a policy's needs, the storage of numbers
-    /// and depth in the loss require. Afterwards the memory of the process includes the driver's.
+    /// Compares the device with the native backend, once per set of kernels that a policy's signals and pixel term, the
+    /// storage of numbers and depth in the loss require. Afterwards the memory of the process includes the driver's.
     ///
     /// # Errors
     /// As [`GpuBackend::new`].
@@ -149,7 +149,7 @@ impl GpuDevice {
         storage: Storage,
         depth: bool,
     ) -> Result<(), BackendError> {
-        let kernels = (RecordLayout::new(needs.signals, depth), storage);
+        let kernels = (RecordLayout::new(needs.signals, depth), storage, needs.pixel_loss);
         self.0.check_once(kernels, || check(self, needs, storage, depth))
     }
 }
@@ -166,6 +166,7 @@ fn check(
 ) -> Result<(), BackendError> {
     let (model, camera, target) = scene();
     let mut options = Setup { threads: Some(1), storage, depth, ..Setup::new(model.len()) };
+    options.needs.pixel_loss = needs.pixel_loss;
     let mut cpu = CpuBackend::new(&model, &options)?;
     options.largest_image = (camera.width, camera.height);
     options.needs.signals = needs.signals;

@@ -5,7 +5,7 @@ use std::pin::pin;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::task::{Context, Poll, Waker};
 
-use densify_policies::policy::Needs;
+use densify_policies::policy::{Needs, PixelLoss};
 use wgpu::{DeviceDescriptor, ErrorFilter, Features, MemoryHints};
 
 use super::adapter::{choose, enumerate, features_for};
@@ -100,8 +100,8 @@ pub(super) struct Device {
     /// Bytes written to the queue since the last wait, for which wgpu holds copies.
     written: Mutex<u64>,
     kernels: Mutex<KernelCache>,
-    /// The record layouts and kinds of storage for which the device has passed the canary.
-    passed: Mutex<Vec<(RecordLayout, Storage)>>,
+    /// The record layouts, kinds of storage and pixel terms for which the device has passed the canary.
+    passed: Mutex<Vec<(RecordLayout, Storage, PixelLoss)>>,
 }
 
 impl Device {
@@ -161,7 +161,7 @@ impl Device {
     /// Runs `check` unless the device has already passed it for these kernels.
     pub(super) fn check_once(
         &self,
-        kernels: (RecordLayout, Storage),
+        kernels: (RecordLayout, Storage, PixelLoss),
         check: impl FnOnce() -> Result<(), BackendError>,
     ) -> Result<(), BackendError> {
         let mut passed = self.passed.lock().unwrap_or_else(PoisonError::into_inner);
