@@ -44,7 +44,7 @@
 //! at all times. The published code exceeds it between insertion and the next pruning; this is not
 //! reproduced. Opacities are never reset. The published settings also use a learning rate of 0.025 for
 //! opacities (`--lr opacity=0.025`), and L1 as the pixel term of the loss, where this policy uses Huber's
-//! function (docs/studies/short-runs.tsv).
+//! function from 40 training views on (docs/studies/short-runs.tsv).
 //!
 //! ## Choices
 //!
@@ -253,7 +253,7 @@ impl DensityPolicy for Diet {
             candidates: self.candidate_request(scene),
             full_depth: self.scene_units(self.params.full_depth, scene),
             aux: self.aux_request(scene),
-            pixel_loss: PixelLoss::Huber,
+            pixel_loss: PixelLoss::for_views(scene.train_views),
             ..Needs::default()
         }
     }

@@ -38,8 +38,8 @@
 //! their opacity `child_opacity` times the parent's. A smaller one is cloned in place.
 //!
 //! Each event is one plan that prunes before it grows, so the budget holds at all times. Opacities are
-//! never reset, the pixel term of the loss is Huber's function, the loss has no additional terms, and learning
-//! rates are the trainer's.
+//! never reset, the pixel term of the loss is Huber's function (L1 below 40 training views), the loss has no
+//! additional terms, and learning rates are the trainer's.
 //!
 //! ## Parameters
 //!
@@ -138,7 +138,12 @@ impl DensityPolicy for Merit {
             }
         }
         let full_depth = (self.params.full_depth * f64::from(scene.extent)) as f32;
-        Needs { signals, full_depth, pixel_loss: PixelLoss::Huber, ..Needs::default() }
+        Needs {
+            signals,
+            full_depth,
+            pixel_loss: PixelLoss::for_views(scene.train_views),
+            ..Needs::default()
+        }
     }
 
     fn is_due(&self, step: u32) -> bool {

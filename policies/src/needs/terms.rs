@@ -19,6 +19,15 @@ pub enum PixelLoss {
 }
 
 impl PixelLoss {
+    /// Number of training views from which [`Huber`](Self::Huber) is the better choice.
+    const ENOUGH_VIEWS: u32 = 40;
+
+    /// The better term for a scene with this many training views, by measurement (docs/studies/short-runs.tsv): with
+    /// few, Huber's function fits them more closely, and other views less.
+    pub fn for_views(train_views: u32) -> Self {
+        if train_views < Self::ENOUGH_VIEWS { Self::L1 } else { Self::Huber }
+    }
+
     /// The difference δ from which the gradient no longer grows; 0 for L1.
     pub fn bound(self) -> f32 {
         match self {

@@ -89,3 +89,10 @@ fn noise_is_halved_at_its_opacity() {
     // σ(−100·(0.1 − 0.005)) = σ(−9.5).
     assert!((noise.share(0.1) / 7.484_62e-5 - 1.0).abs() < 1e-4);
 }
+
+#[test]
+fn scenes_with_few_views_are_trained_with_l1() {
+    let [few, enough] = [39, 40].map(PixelLoss::for_views);
+    assert_eq!((few, enough), (PixelLoss::L1, PixelLoss::Huber));
+    assert!(few.bound() == 0.0 && enough.bound() > 0.0);
+}
