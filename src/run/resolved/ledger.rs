@@ -23,8 +23,8 @@ use densify_train::metrics::{geometry, scratch_bytes};
 use densify_train::trainer::AutoChoices;
 
 /// Memory of the program itself `[bytes]`: the code pages in use, and the stacks of its threads. Measured at 15 to 17
-/// MiB, and at 20 MiB in builds for tests (profile `dev`). It varies with what the system has mapped already.
-const PROGRAM: u64 = 24 << 20;
+/// MiB, and at up to 20 MiB in builds for tests (profile `dev`): it varies with what the system has mapped already.
+const PROGRAM: u64 = 16 << 20;
 /// If the process takes more than expected, for example because of a driver, its actual memory counts, rounded up to a
 /// multiple of this number so that the ledger does not change from call to call `[bytes]`.
 const PROGRAM_STEP: u64 = 8 << 20;
