@@ -118,7 +118,7 @@ class Options(TypedDict, total=False):
     """Seed of all random numbers (default: 0)"""
 
     lr: Mapping[str, float]
-    """Set a learning rate: mean_start, mean_end, log_scale, quat, opacity, sh_dc, sh_rest; for all but the means also NAME_end; fade: final factor of opacity, sh_dc and sh_rest, which sets in after the share fade_from of the run; boost: initial factor of all rates (1 in runs of 30,000 iterations). A rate of 0 freezes its values. May be repeated"""
+    """Set a learning rate: mean_start, mean_end, log_scale, quat, opacity, sh_dc, sh_rest; for all but the means also NAME_end; noise_end: noise on the means at the end; fade: final factor of opacity, sh_dc and sh_rest, which sets in after the share fade_from of the run; boost: initial factor of all rates (1 in runs of 30,000 iterations). A rate of 0 freezes its values. May be repeated"""
 
     preset: str
     """Set several options and knobs at once: exact, balanced, fast or tiny-memory. Options that are given override the preset (default: balanced)"""
