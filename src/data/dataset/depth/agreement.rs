@@ -20,6 +20,9 @@ const AGREES: f64 = 0.03;
 /// A shift is reported if it lowers the mean disagreement to this share.
 const CLEARER: f64 = 0.85;
 
+/// Distance between pairs that exchange their depths; a prime, so that they are far apart.
+const STRIDE: usize = 7919;
+
 /// A point that a view sees.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct SeenPoint {
@@ -76,6 +79,8 @@ pub(super) struct Verdict {
     pub(super) scale: f64,
     /// Half of the ratios differ from each other by at most this much, relatively.
     pub(super) spread: f64,
+    /// The same, if every point had the map's depth of another place.
+    pub(super) unrelated_spread: f64,
     /// The kind of error that the ratios show, other than a wrong scale.
     pub(super) fault: Option<Fault>,
     /// Half of the views differ in their scales by at least this much, relatively; 0 with few views.
@@ -162,9 +167,20 @@ impl Agreement {
             pairs: self.pairs.len(),
             scale: scale.exp(),
             spread: plain.exp_m1(),
+            unrelated_spread: self.unrelated_spread().exp_m1(),
             fault: meaning.or_else(|| self.shift()),
             between_views: between_views.exp_m1(),
         })
+    }
+
+    /// The spread of ln(map / point) if points and depths are paired at random.
+    fn unrelated_spread(&self) -> f64 {
+        let others = (0..self.pairs.len()).map(|i| i * STRIDE % self.pairs.len());
+        let pairs = self.pairs.iter().zip(others);
+        let mut values: Vec<f64> =
+            pairs.map(|(pair, other)| self.pairs[other].map - pair.point).collect();
+        values.sort_unstable_by(f64::total_cmp);
+        spread(&values)
     }
 
     /// The shift at which points and map agree clearly better than without any.
