@@ -33,6 +33,33 @@ fn surface(@builtin(global_invocation_id) id: vec3<u32>) {
     points[launch.d + i] = point;
 }
 
+// A quarter of numbers for another purpose, then the depths of the pixels; 0: not known.
+@group(0) @binding(13) var<storage, read_write> depths: array<f32>;
+
+// Completes the depths with those of the rows at which transmittance falls below 1/2, and reduces all to those below
+// which a row is in front of the surface. launch.a: the band of tiles, launch.b: number of pixels, launch.c: bits of the
+// factor.
+@compute @workgroup_size(256)
+fn find_front(@builtin(global_invocation_id) id: vec3<u32>) {
+    let pixel = index_of(id);
+    if pixel >= launch.b {
+        return;
+    }
+    let at = vec2(pixel % frame.image.x, pixel / frame.image.x);
+    let tile = at.y / TILE * frame.image.z + at.x / TILE;
+    if tile < state.cuts[launch.a] || tile >= state.cuts[launch.a + 1u] {
+        return;
+    }
+    var depth = depths[launch.b + pixel];
+    if depth == 0.0 {
+        let row = surface_row(tile, vec2<f32>(at) + 0.5, true);
+        if row != NONE {
+            depth = splats[SPLAT * row + DEPTH];
+        }
+    }
+    depths[launch.b + pixel] = depth * bitcast<f32>(launch.c);
+}
+
 fn surface_row(tile: u32, at: vec2<f32>, is_median: bool) -> u32 {
     var light = 1.0;
     var best = NONE;

@@ -1,7 +1,7 @@
 // Auxiliary views: sums over the pixels into which each row is blended, front to back, as in
 // src/render/cpu/observe.rs. One record per entry, as in rasterize_bwd.wgsl.
 
-// The pixel map; see `PixelMap` in the policies.
+// The pixel map (see `PixelMap` in the policies), followed by the depths below which a row is in front of the surface.
 @group(0) @binding(6) var<storage, read> map: array<f32>;
 // One record per slot: the values of `splat_sums`.
 @group(0) @binding(7) var<storage, read_write> records: array<f32>;
@@ -13,7 +13,7 @@ fn store_splat(
     count: u32,
     lane: u32,
     quad: Quad,
-    map_here: vec4<f32>,
+    map_here: MapPart,
     pixels: ptr<function, ForwardPixels>,
 ) {
     var sums = array<f32, COLUMNS>();

@@ -1,6 +1,6 @@
 // The sums of observe.wgsl, but added with atomics straight to each row's sums, as in rasterize_bwd_atomic.wgsl.
 
-// The pixel map; see `PixelMap` in the policies.
+// The pixel map (see `PixelMap` in the policies), followed by the depths below which a row is in front of the surface.
 @group(0) @binding(6) var<storage, read> map: array<f32>;
 
 // Adds the subgroup's contribution to the sums of splat i of the `count` loaded ones.
@@ -9,7 +9,7 @@ fn add_splat(
     count: u32,
     m: Member,
     quad: Quad,
-    map_here: vec4<f32>,
+    map_here: MapPart,
     pixels: ptr<function, ForwardPixels>,
 ) {
     if i >= count {

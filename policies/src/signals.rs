@@ -324,6 +324,11 @@ pub enum AuxColumn {
     WeightMax,
     /// Number of pixels in which no other row has a larger blend weight, >= 0.
     DominantPixels,
+    /// Sum of the blend weights α·T over pixels whose surface lies behind the row's mean, by more than the
+    /// [margin](crate::policy::AuxRequest::margin), >= 0. The surface is the given depth if the run trains on depth
+    /// and it is known at the pixel, or else the depth of the row at which transmittance falls below ½. Divided by
+    /// [`WeightSum`](Self::WeightSum) it is the share of the row's weight before the surface.
+    WeightInFront,
     /// Camera z of the mean `[scene units]`.
     Depth,
     /// Radius on screen, three standard deviations along the longer axis, rounded up `[px]`.
@@ -332,13 +337,14 @@ pub enum AuxColumn {
 
 impl AuxColumn {
     /// All columns, in declaration order.
-    pub const ALL: [Self; 8] = [
+    pub const ALL: [Self; 9] = [
         Self::MapSum,
         Self::PixelCount,
         Self::WeightSum,
         Self::DistanceSum,
         Self::WeightMax,
         Self::DominantPixels,
+        Self::WeightInFront,
         Self::Depth,
         Self::Radius,
     ];

@@ -116,11 +116,15 @@ class PixelMap:
 
 @dataclass(frozen=True)
 class Aux:
-    """Measurements in auxiliary views, which ``observe`` receives."""
+    """Measurements in auxiliary views, which ``observe`` receives.
+
+    ``margin``: distance from the surface, as a fraction of its depth, from which ``weight_in_front`` counts a row.
+    """
 
     columns: Sequence[Column] = ()
     map: PixelMap = field(default_factory=PixelMap)
     points: int = 0
+    margin: float = 0.05
 
 
 @dataclass(frozen=True)

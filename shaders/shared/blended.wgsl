@@ -1,17 +1,25 @@
 // A splat's sums over the pixels of an auxiliary view, for observe.wgsl and observe_atomic.wgsl.
 
 // Values (columns) per splat: sum of the pixel map, number of pixels, sum of blend weights, sum of distances from the
-// mean [px], largest weight.
-const COLUMNS: u32 = 5u;
+// mean [px], sum of blend weights in front of the surface, largest weight.
+const COLUMNS: u32 = 6u;
 // The value that is a maximum; the others are sums.
-const MAXIMUM: u32 = 4u;
+const MAXIMUM: u32 = 5u;
 
-// The pixel map at an invocation's pixels; 0 outside the image.
-fn map_at(quad: Quad) -> vec4<f32> {
-    var here = vec4(0.0);
+// What an invocation's pixels add to the sums; 0 outside the image.
+struct MapPart {
+    // The pixel map.
+    value: vec4<f32>,
+    // Depth below which a row is in front of the surface.
+    front: vec4<f32>,
+}
+
+fn map_at(quad: Quad) -> MapPart {
+    var here = MapPart(vec4(0.0), vec4(0.0));
     for (var p = 0u; p < 4u; p++) {
         if quad.inside[p] {
-            here[p] = map[quad.place[p]];
+            here.value[p] = map[quad.place[p]];
+            here.front[p] = map[frame.image.x * frame.image.y + quad.place[p]];
         }
     }
     return here;
@@ -21,7 +29,7 @@ fn map_at(quad: Quad) -> vec4<f32> {
 fn splat_sums(
     splat: Splat,
     quad: Quad,
-    map_here: vec4<f32>,
+    map_here: MapPart,
     pixels: ptr<function, ForwardPixels>,
 ) -> array<f32, COLUMNS> {
     let w = blend(falloff(splat, quad).exponent, pixels);
@@ -29,5 +37,6 @@ fn splat_sums(
     let y = quad.y - splat.a.y;
     let one = select(vec4(0.0), vec4(1.0), w > vec4(0.0));
     let distance = total(one * sqrt(x * x + y * y));
-    return array(total(one * map_here), total(one), total(w), distance, largest(w));
+    let in_front = select(vec4(0.0), w, vec4(splat.b.z) < map_here.front);
+    return array(total(one * map_here.value), total(one), total(w), distance, total(in_front), largest(w));
 }

@@ -52,6 +52,12 @@ impl Camera {
         (DVec2::new(self.fx * p.x / p.z + self.cx, self.fy * p.y / p.z + self.cy), p.z)
     }
 
+    /// The world point at pixel coordinates and depth (camera z): the inverse of [`project`](Self::project).
+    pub fn unproject(&self, pixel: DVec2, depth: f64) -> DVec3 {
+        let ray = DVec3::new((pixel.x - self.cx) / self.fx, (pixel.y - self.cy) / self.fy, 1.0);
+        self.rotation.transpose() * (depth * ray - self.translation)
+    }
+
     /// The depth of a world point if it is in front of the camera and its projection is in the image; `None` otherwise.
     /// The image is extended at every edge by `margin`, a fraction of its width or height.
     pub fn depth_in_image(&self, world: DVec3, margin: f64) -> Option<f64> {

@@ -6,9 +6,12 @@ use std::collections::HashMap;
 
 use densify_policies::policy::{Candidate, CandidateRequest, ErrorMap, ErrorMode};
 
-use super::{StateError, Tensor};
+use super::{AuxInput, StateError, StepInput, Tensor};
+use densify_core::camera::Camera;
 use densify_core::colour::ColourTransform;
 use densify_core::image::Image8;
+use densify_core::image::depth::DepthMap;
+use glam::DVec2;
 
 /// The candidates collected so far, and the request that selects them.
 #[derive(Debug)]
@@ -18,23 +21,46 @@ pub(super) struct Candidates {
     ranking: Vec<RankedPixel>,
 }
 
-/// A photograph with the background and exposure of its view.
+/// A photograph with the camera, background, exposure and given depth of its view.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Photograph<'a> {
-    pub(super) target: &'a Image8,
-    pub(super) background: [f32; 3],
-    pub(super) exposure: Option<&'a ColourTransform>,
+    camera: &'a Camera,
+    target: &'a Image8,
+    background: [f32; 3],
+    exposure: Option<&'a ColourTransform>,
+    depth: Option<&'a DepthMap>,
+}
+
+impl<'a> From<&StepInput<'a>> for Photograph<'a> {
+    fn from(input: &StepInput<'a>) -> Self {
+        let StepInput { camera, target, background, exposure, depth, .. } = *input;
+        Self { camera, target, background, exposure, depth: depth.map(|depth| depth.map) }
+    }
+}
+
+impl<'a> From<&AuxInput<'a>> for Photograph<'a> {
+    fn from(input: &AuxInput<'a>) -> Self {
+        let AuxInput { camera, target, background, exposure, depth, .. } = *input;
+        Self { camera, target, background, exposure, depth }
+    }
 }
 
 impl<'a> Photograph<'a> {
     /// A function that returns the scene's colour at a pixel (x, y), with the exposure undone.
     pub(super) fn scene_colours(self) -> impl Fn(usize, usize) -> [f32; 3] + Sync + 'a {
-        let Self { target, background, exposure } = self;
+        let Self { target, background, exposure, .. } = self;
         let inverse = exposure.map(ColourTransform::inverse);
         move |x, y| {
             let seen = target.composited(x, y, background);
             inverse.map_or(seen, |inverse| inverse.apply(seen))
         }
+    }
+
+    /// The point at the given depth of a pixel (x, y) `[scene units]`, and this depth; `None` where it is unknown.
+    pub(super) fn given_point(&self, x: usize, y: usize) -> Option<([f32; 3], f32)> {
+        let depth = self.depth?.known_depth(y * self.camera.width as usize + x)?;
+        let centre = DVec2::new(x as f64 + 0.5, y as f64 + 0.5);
+        Some((self.camera.unproject(centre, depth.into()).as_vec3().to_array(), depth))
     }
 }
 

@@ -64,15 +64,6 @@ impl SurfaceDepths {
     }
 }
 
-/// Blend weights of a row, summed over the pixels of a view.
-#[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub struct RowWeights {
-    /// Σ α·T over the pixels in which the row's mean is nearer than a given depth.
-    pub in_front: f32,
-    /// Σ α·T over all pixels.
-    pub whole: f32,
-}
-
 /// Renders properties of the rows instead of their colours.
 pub trait Inspect {
     /// Renders a view with the given colours instead of the rows' own: sRGB-encoded, >= 0, the same from every
@@ -109,22 +100,5 @@ pub trait Inspect {
     /// [`BackendError::Unsupported`] on a GPU.
     fn render_depths(&mut self, _camera: &Camera) -> Result<SurfaceDepths, BackendError> {
         Err(BackendError::Unsupported("median depth"))
-    }
-
-    /// Measures the weight of each row in a view, and the part of it that is nearer than `surface` (camera-space z
-    /// `[scene units]`; nothing is nearer than 0. Shape: `[height, width]`). Model and signals are unchanged. Shape of
-    /// the result: `[rows]`.
-    ///
-    /// # Errors
-    /// [`BackendError::Unsupported`] on a GPU.
-    ///
-    /// # Panics
-    /// When there is not one depth per pixel: a bug in the caller.
-    fn weights_in_front(
-        &mut self,
-        _camera: &Camera,
-        _surface: &[f32],
-    ) -> Result<Vec<RowWeights>, BackendError> {
-        Err(BackendError::Unsupported("weights in front of a surface"))
     }
 }

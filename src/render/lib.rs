@@ -39,12 +39,13 @@ use densify_core::camera::Camera;
 use densify_core::colour::{ColourGradient, ColourTransform};
 use densify_core::gaussians::{Gaussians, ModelArray};
 use densify_core::image::Image8;
+use densify_core::image::depth::DepthMap;
 use densify_core::memory::Ledger;
 pub use densify_shaders::Accumulation;
 pub use depth::{DepthTarget, DepthTerm};
 pub use differentiable::{Differentiable, ImageGradient};
 pub use error::{BackendError, Fit};
-pub use inspect::{DepthKind, Inspect, RowWeights, SurfaceDepths};
+pub use inspect::{DepthKind, Inspect, SurfaceDepths};
 pub use setup::{KeptPhotographs, MomentStorage, ParameterStorage, Setup, Shortcuts, Storage};
 pub use state::{StateArray, StateError, Tensor, Values};
 
@@ -126,6 +127,8 @@ pub struct AuxInput<'a> {
     pub exposure: Option<&'a ColourTransform>,
     /// Spherical-harmonic degree to evaluate, <= the model's.
     pub sh_degree: u8,
+    /// The given depth of the view, of the camera's size, if the run trains on depth.
+    pub depth: Option<&'a DepthMap>,
     /// The measurements requested.
     pub request: &'a AuxRequest,
 }

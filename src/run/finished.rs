@@ -52,7 +52,8 @@ impl Machine {
         self.backend_for(dataset, model, near, Needs::default())
     }
 
-    fn backend_for(
+    /// As [`backend`](Self::backend), to measure what these needs declare.
+    pub fn backend_for(
         &self,
         dataset: &Dataset,
         model: Gaussians,

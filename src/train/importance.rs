@@ -1,6 +1,6 @@
 //! Importance of Gaussians in the training views, for reducing models that exceed the budget.
 
-use densify_policies::policy::{AuxColumn, AuxRequest, Needs, PixelMap};
+use densify_policies::policy::{AuxColumn, AuxRequest, Needs};
 
 use crate::metrics::EvaluateError;
 use densify_core::gaussians::{Gaussians, sigmoid};
@@ -13,7 +13,7 @@ pub fn needs() -> Needs {
 }
 
 fn request() -> AuxRequest {
-    AuxRequest { map: PixelMap::default(), columns: vec![AuxColumn::WeightSum], points: 0 }
+    AuxRequest { columns: vec![AuxColumn::WeightSum], ..AuxRequest::default() }
 }
 
 /// Memory that [`importance`] needs in addition to the backend and one image `[bytes]`.
@@ -48,6 +48,7 @@ pub fn importance(
             background,
             exposure: None,
             sh_degree,
+            depth: None,
             request: &request,
         };
         let output = backend.observe(&input);

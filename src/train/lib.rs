@@ -5,6 +5,7 @@ pub mod checkpoint;
 pub mod evaluate;
 pub mod exposure;
 pub mod importance;
+pub mod in_front;
 pub mod init;
 pub mod metrics;
 pub mod output;

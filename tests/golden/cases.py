@@ -41,6 +41,7 @@ INTENDED = [
     Intended("*", "*geometry*.json", r'"(weight_before_surface|spread)":', "measurements that the reference lacks"),
     Intended("*", "*.out", r"^(depth spread along rays|weight before the surface)", "measurements that it lacks"),
     Intended("*", "*config.toml", r'^coordinates = "auto"$', "an option that the reference does not have"),
+    Intended("*", "*config.toml", r"^remove_floaters = false$", "an option that the reference does not have"),
 ]
 
 SCENES = {"spheres": "scene:spheres", "room256": "{data}/room256", "fox": "{data}/fox -r 8"}

@@ -5,6 +5,7 @@
 use densify::core::camera::Camera;
 use densify::core::gaussians::Gaussians;
 use densify::core::image::Image8;
+use densify::core::image::depth::DepthMap;
 use densify::render::{AuxInput, AuxOutput, Backend, StepInput};
 use densify_policies::policy::{AuxColumn, AuxRequest, Needs, PixelMap, Signal, SignalSet};
 use glam::DVec3;
@@ -21,10 +22,14 @@ const BACKGROUND: [f32; 3] = [0.1, 0.3, 0.2];
 /// The tolerance of pixel sums in `signals`: pixels near the alpha threshold may flip.
 const TOLERANCE: f64 = 1e-3;
 
+const MARGIN: f32 = 0.1;
+
 struct Scene {
     camera: Camera,
     model: Gaussians,
     target: Image8,
+    /// Given depth of some pixels.
+    depth: Option<DepthMap>,
 }
 
 fn scene() -> Scene {
@@ -40,11 +45,18 @@ fn scene() -> Scene {
     // Half of the pixels have full weight; the others are weighted partly or not at all.
     let weight = |i: usize| if i.is_multiple_of(2) { 255 } else { (i % 3) as u8 * 64 };
     target.mask = Some((0..target.rgb.len() / 3).map(weight).collect());
-    Scene { camera, model, target }
+    // In a third of the pixels the depth is given, from in front of all Gaussians to behind them.
+    let pixels = target.rgb.len() / 3;
+    let inverse: Vec<f32> = (0..pixels)
+        .map(|i| if i % 3 == 0 { 1.0 / (1.0 + (i % 17) as f32 / 2.0) } else { 0.0 })
+        .collect();
+    let size = (camera.width, camera.height);
+    let depth = DepthMap::quantised(size, &inverse, vec![255; pixels]);
+    Scene { camera, model, target, depth }
 }
 
 fn request(map: PixelMap) -> AuxRequest {
-    AuxRequest { map, columns: AuxColumn::ALL.to_vec(), points: 0 }
+    AuxRequest { map, columns: AuxColumn::ALL.to_vec(), margin: MARGIN, ..AuxRequest::default() }
 }
 
 /// Creates a backend. `cap` limits the entries of its tile lists; gradient records are limited to half of `cap`.
@@ -80,6 +92,7 @@ fn observe(
         background: BACKGROUND,
         exposure: None,
         sh_degree: 2,
+        depth: scene.depth.as_ref(),
         request,
     };
     backend.observe(&input).expect("a small image is rendered")
@@ -129,6 +142,27 @@ fn pixel_map(scene: &Scene, image: &Image, weights: PixelMap) -> Vec<f64> {
     parts.map(|(e, g)| f64::from(weights.error) * e + f64::from(weights.edge) * g).collect()
 }
 
+/// The depth of each pixel below which a row is in front of the surface. `blended` calls its argument with pixel, depth
+/// and weight of each blended Gaussian, those of a pixel from front to back.
+fn fronts(scene: &Scene, blended: impl FnOnce(&mut dyn FnMut(usize, f64, f64))) -> Vec<f64> {
+    let depth = scene.depth.as_ref().expect("depth");
+    let mut light = vec![1.0; depth.inverse.len()];
+    let mut median = vec![0.0; light.len()];
+    blended(&mut |pixel, depth, weight| {
+        let before = light[pixel];
+        light[pixel] -= weight;
+        if before >= 0.5 && light[pixel] < 0.5 {
+            median[pixel] = depth;
+        }
+    });
+    let surface = |(pixel, median): (usize, f64)| match depth.inverse_depth(pixel) {
+        [_, 0.0] => median,
+        [inverse, _] => 1.0 / f64::from(inverse),
+    };
+    let surfaces = median.into_iter().enumerate().map(surface);
+    surfaces.map(|surface| surface * (1.0 - f64::from(MARGIN))).collect()
+}
+
 #[test]
 fn every_column_matches_the_reference() {
     let scene = scene();
@@ -141,13 +175,19 @@ fn every_column_matches_the_reference() {
     // The smallest cap forces several bands.
     for (weights, cap) in maps.into_iter().zip([10_000, 10_000, 1]) {
         let pixels = pixel_map(&scene, &image, weights);
-        let mut sums = vec![[0.0_f64; 5]; scene.model.len()];
+        let fronts = fronts(&scene, |each| {
+            each_blended(&splats, &order, view, &Rules::STANDARD, |p, row, weight, _| {
+                each(p, splats[row].depth, weight);
+            });
+        });
+        let mut sums = vec![[0.0_f64; 6]; scene.model.len()];
         let mut largest = vec![(0.0, None); pixels.len()];
         each_blended(&splats, &order, view, &Rules::STANDARD, |p, row, weight, distance| {
-            for (sum, x) in sums[row].iter_mut().zip([pixels[p], 1.0, weight, distance]) {
+            let in_front = if splats[row].depth < fronts[p] { weight } else { 0.0 };
+            for (sum, x) in sums[row].iter_mut().zip([pixels[p], 1.0, weight, distance, in_front]) {
                 *sum += x;
             }
-            sums[row][4] = sums[row][4].max(weight);
+            sums[row][5] = sums[row][5].max(weight);
             if weight > largest[p].0 {
                 largest[p] = (weight, Some(row));
             }
@@ -155,12 +195,15 @@ fn every_column_matches_the_reference() {
         // A Gaussian can be on screen without being blended in any pixel.
         let shown: Vec<usize> = (0..sums.len()).filter(|&row| sums[row][1] > 0.0).collect();
         assert!(shown.len() > 20 && shown[0] > 0, "{}", shown.len());
+        let is_divided = |row: &usize| sums[*row][4] > 0.0 && sums[*row][4] < sums[*row][2];
+        assert!(shown.iter().filter(|row| is_divided(row)).count() > 5);
         let expected = |column: AuxColumn, row: usize| match column {
             AuxColumn::MapSum => sums[row][0],
             AuxColumn::PixelCount => sums[row][1],
             AuxColumn::WeightSum => sums[row][2],
             AuxColumn::DistanceSum => sums[row][3],
-            AuxColumn::WeightMax => sums[row][4],
+            AuxColumn::WeightInFront => sums[row][4],
+            AuxColumn::WeightMax => sums[row][5],
             AuxColumn::DominantPixels => {
                 largest.iter().filter(|pixel| pixel.1 == Some(row)).count() as f64
             }
@@ -246,7 +289,8 @@ fn opaque_on_the_left() -> Scene {
     let model = scenes::one_at(&camera, local, [0.2; 3]);
     let n = 3 * (camera.width * camera.height) as usize;
     let rgb = (0..n).map(|i| (i % 251) as u8).collect();
-    Scene { camera, model, target: Image8 { width: 60, height: 40, rgb, alpha: None, mask: None } }
+    let target = Image8 { width: 60, height: 40, rgb, alpha: None, mask: None };
+    Scene { camera, model, target, depth: None }
 }
 
 fn points_lie_on_surfaces_and_follow_alpha_on(subject: &Subject) {

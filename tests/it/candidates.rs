@@ -3,7 +3,8 @@
 use densify::core::camera::Camera;
 use densify::core::gaussians::{Gaussians, logit, rgb_to_dc};
 use densify::core::image::Image8;
-use densify::render::{AdapterKind, Backend, Rendering, StepInput};
+use densify::core::image::depth::DepthMap;
+use densify::render::{AdapterKind, Backend, DepthTarget, DepthTerm, Rendering, StepInput};
 use densify::selftest::compare::Table;
 use densify::selftest::{Differentiable, Setup, Subject, scenes};
 use densify_policies::policy::{Candidate, CandidateRequest, DepthMode, ErrorMode, Needs};
@@ -180,6 +181,41 @@ fn candidates_require_the_minimum_alpha() {
             mode == ErrorMode::Gradient || faint > all / 2,
             "{mode:?}: the minimum alpha excludes nothing"
         );
+    }
+}
+
+#[test]
+fn candidates_lie_at_the_given_depth_where_it_is_known() {
+    let model = plane(2.0);
+    let camera = camera();
+    let side = SIDE as usize;
+    // The depth is known in the upper half, where the surface is farther away than in the model.
+    let pixels = side * side;
+    let inverse: Vec<f32> =
+        (0..pixels).map(|i| if i < pixels / 2 { 1.0 / 3.0 } else { 0.0 }).collect();
+    let map = DepthMap::quantised((SIDE, SIDE), &inverse, vec![255; pixels]).expect("depth");
+    let image = image(|i| if i / 3 % side > 48 { 0.9 } else { 0.4 });
+    for subject in repeatable() {
+        let request = CandidateRequest { rows_per_candidate: 16, ..request(ErrorMode::L1, 0.5) };
+        let needs = Needs { candidates: Some(request), ..Needs::default() };
+        let mut backend =
+            make_with(&subject, &model, Setup { needs, depth: true, ..Setup::default() });
+        let depth = Some(DepthTarget { map: &map, weight: 0.1, term: DepthTerm::Expected });
+        let input = StepInput { background: GREY, depth, ..step_input(1, &camera, &image, 0) };
+        backend.train_step(&input).expect("a step");
+        let found = backend.candidates();
+        let is_above = |candidate: &&Candidate| pixel(candidate).y < f64::from(SIDE / 2);
+        let above = found.iter().filter(is_above).count();
+        assert!(above > 9 && above + 9 < found.len(), "{}: {above}", subject.name());
+        for candidate in found {
+            let (at, depth) = camera.project(DVec3::from(candidate.position.map(f64::from)));
+            let expected = if is_above(&candidate) { 3.0 } else { 2.0 };
+            assert!((depth - expected).abs() < 2e-2, "{}: {depth} at {at}", subject.name());
+            // The point is on the ray of its pixel's centre.
+            assert!((at - at.floor() - 0.5).abs().max_element() < 1e-3, "{at}");
+            let size = f64::from(candidate.pixel_size) * f64::from(SIDE);
+            assert!((size / depth - 1.0).abs() < 1e-3, "{size} at {depth}");
+        }
     }
 }
 

@@ -236,6 +236,7 @@ fn auxiliary_views_and_candidates_apply_the_exposure() {
             background: BLUE,
             exposure: Some(&EXPOSURE),
             sh_degree: 1,
+            depth: None,
             request: &request,
         });
         let observed = observed.expect("a small image is rendered");

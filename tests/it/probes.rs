@@ -63,6 +63,7 @@ fn state(backend: Box<dyn Backend>, dataset: &Dataset, measures: bool) -> (Gauss
         on_nan: OnNan::Stop,
         depth: None,
         distortion: 0.0,
+        removes_floaters: false,
     };
     let views = DatasetViews::new(dataset.train.clone(), 1 << 20, 1);
     let trainer = Trainer::new(views, backend, ("idle", Box::new(Idle)), scene, options);

@@ -145,6 +145,7 @@ fn trained(policy: Spatial, backend: Box<dyn Backend>, camera: &Camera) -> (Gaus
         on_nan: OnNan::Stop,
         depth: None,
         distortion: 0.0,
+        removes_floaters: false,
     };
     let views = OneView(*camera, Arc::new(scenes::target(camera)));
     let policy: Box<dyn DensityPolicy> = Box::new(policy);

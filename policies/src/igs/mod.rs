@@ -174,7 +174,11 @@ impl DensityPolicy for Igs {
         let map = PixelMap { error: 0.0, edge: 1.0 };
         Needs {
             signals: [Signal::VisibleCount, Signal::ScreenGradientAbs, Signal::Opacity].into(),
-            aux: Some(AuxRequest { map, columns: vec![AuxColumn::MapSum], points: 0 }),
+            aux: Some(AuxRequest {
+                map,
+                columns: vec![AuxColumn::MapSum],
+                ..AuxRequest::default()
+            }),
             cadence: Cadence { all: self.sums[0].max(self.sums[1]), sh_rest: 1 },
             rates: RateOverrides {
                 mean: Some(Rate { start: params.mean_start, end: params.mean_end }),

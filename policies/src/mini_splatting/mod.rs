@@ -92,7 +92,7 @@ use crate::parameters::StepParameter::{self, Step};
 use crate::parameters::extended;
 use crate::plan::{EditPlan, Reset, Update};
 use crate::policy::{
-    AuxColumn, AuxRequest, AuxView, Candidate, DensityPolicy, Needs, PixelMap, PolicyResult, Rate,
+    AuxColumn, AuxRequest, AuxView, Candidate, DensityPolicy, Needs, PolicyResult, Rate,
     RateOverrides, SceneInfo, Signal, SignalSet, Snapshot,
 };
 use crate::prune::{Victims, ViewAccumulator};
@@ -156,9 +156,9 @@ impl DensityPolicy for MiniSplatting {
         let max_rows = self.reinit_rows(scene.budget);
         let opacity = Some(Rate::constant(self.params.opacity_rate));
         let aux = AuxRequest {
-            map: PixelMap::default(),
             columns: vec![AuxColumn::WeightSum, AuxColumn::PixelCount, AuxColumn::DominantPixels],
             points: if rebuilds { points_per_view(max_rows, scene.train_views) } else { 0 },
+            ..AuxRequest::default()
         };
         Needs {
             signals: growth.signals.with(Signal::DominantPixels).with(Signal::Position),

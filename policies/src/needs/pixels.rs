@@ -109,7 +109,8 @@ pub struct CandidateRequest {
     pub capacity: usize,
     /// The error that ranks pixels.
     pub error: ErrorMode,
-    /// The surface point on the pixel's ray.
+    /// The surface point on the pixel's ray. Where the run trains on depth and that of the pixel is known, the point
+    /// lies at the given depth instead.
     pub depth: DepthMode,
     /// Smallest accumulated alpha of a pixel, in `[0, 1]`: a transparent pixel has no depth.
     pub min_alpha: f32,
@@ -143,7 +144,7 @@ pub enum DepthMode {
 }
 
 /// Measurements in an auxiliary view: a training view rendered for one event of the policy.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct AuxRequest {
     /// The pixel map M that [`AuxColumn::MapSum`] sums.
@@ -153,6 +154,15 @@ pub struct AuxRequest {
     /// Maximum number of surface points per view: pixels drawn without replacement in proportion to their
     /// accumulated alpha, with the surface point of [`DepthMode::MaxWeight`].
     pub points: u32,
+    /// Distance from the surface above which [`AuxColumn::WeightInFront`] counts a row as in front of it, as a fraction
+    /// of the surface's depth, in `0..1`.
+    pub margin: f32,
+}
+
+impl Default for AuxRequest {
+    fn default() -> Self {
+        Self { map: PixelMap::default(), columns: Vec::new(), points: 0, margin: 0.05 }
+    }
 }
 
 /// The pixel map M(p) = `error`·n(e) + `edge`·n(g).

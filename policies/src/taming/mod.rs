@@ -93,13 +93,13 @@ use crate::parameters::StepParameter::{self, Interval, Step};
 use crate::parameters::in_range;
 use crate::plan::{EditPlan, Reset};
 use crate::policy::{
-    AuxColumn, AuxRequest, AuxView, Cadence, DensityPolicy, Needs, PixelMap, PolicyResult, Rate,
+    AuxRequest, AuxView, Cadence, DensityPolicy, Needs, PixelMap, PolicyResult, Rate,
     RateOverrides, SceneInfo, Signal, SignalSet, Snapshot,
 };
 use crate::registry::ConfiguredPolicy;
 use crate::rng::PolicyRng;
 use crate::sample::weighted;
-use score::Score;
+use score::{COLUMNS, Score};
 
 mod parameters;
 mod score;
@@ -163,7 +163,7 @@ impl DensityPolicy for Taming {
         let sh_rest = Some(Rate::constant(params.sh_rest));
         Needs {
             signals: SignalSet::from(GROWTH_SIGNALS).with(Signal::ScaleProduct),
-            aux: Some(AuxRequest { map, columns: AuxColumn::ALL.to_vec(), points: 0 }),
+            aux: Some(AuxRequest { map, columns: COLUMNS.to_vec(), ..AuxRequest::default() }),
             cadence: Cadence { all: 1, sh_rest: params.sh_every },
             rates: RateOverrides { sh_rest, ..RateOverrides::default() },
             ..Needs::default()

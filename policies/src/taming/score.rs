@@ -19,6 +19,16 @@ pub(super) struct Score {
     loss_sums: Vec<f32>,
 }
 
+/// The columns of each view that the score combines.
+pub(super) const COLUMNS: [AuxColumn; 6] = [
+    AuxColumn::Depth,
+    AuxColumn::Radius,
+    AuxColumn::DistanceSum,
+    AuxColumn::MapSum,
+    AuxColumn::PixelCount,
+    AuxColumn::WeightSum,
+];
+
 impl Score {
     /// Adds one view.
     pub(super) fn add(&mut self, view: &AuxView<'_>, params: &TamingParams) -> PolicyResult {
@@ -26,16 +36,16 @@ impl Score {
             let zeros = vec![0.0; view.rows];
             *self = Self { step: view.step, view_terms: zeros.clone(), loss_sums: zeros };
         }
-        let terms = [
-            (params.depth_weight, AuxColumn::Depth),
-            (params.radius_weight, AuxColumn::Radius),
-            (params.distance_weight, AuxColumn::DistanceSum),
-            (params.map_weight, AuxColumn::MapSum),
-            (params.count_weight, AuxColumn::PixelCount),
-            (params.blend_weight, AuxColumn::WeightSum),
+        let weights = [
+            params.depth_weight,
+            params.radius_weight,
+            params.distance_weight,
+            params.map_weight,
+            params.count_weight,
+            params.blend_weight,
         ];
         let mut sum = vec![0.0; view.rows];
-        for (weight, column) in terms {
+        for (weight, column) in weights.into_iter().zip(COLUMNS) {
             add_term(&mut sum, weight as f32, view.column(column)?);
         }
         let weight = VIEW_WEIGHT * view.loss;

@@ -3,6 +3,7 @@
 use super::*;
 use crate::event::{Event, Outcome, View, assert_conforms, build, due_steps};
 use crate::plan::EditCounts;
+use crate::policy::AuxColumn;
 
 fn run(event: &Event, set: &str) -> Outcome {
     event.run("taming", set)
@@ -14,7 +15,7 @@ fn event(step: u32, rows: usize, budget: usize) -> Event {
     let mut event = Event::small_rows(step, rows, budget)
         .with_all(Signal::ScreenGradient, 4.0)
         .with_all(Signal::ScaleProduct, 1e-4);
-    let columns = AuxColumn::ALL.map(|column| (column, vec![2.0; rows])).to_vec();
+    let columns = COLUMNS.map(|column| (column, vec![2.0; rows])).to_vec();
     event.views = vec![View { loss: 0.02, columns, points: Vec::new() }];
     event
 }

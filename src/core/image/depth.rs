@@ -30,6 +30,12 @@ impl DepthMap {
         [f32::from(self.inverse[pixel]) * self.unit, f32::from(confidence) / 255.0]
     }
 
+    /// The depth of a pixel `[scene units]`; `None` where it is unknown or does not count.
+    pub fn known_depth(&self, pixel: usize) -> Option<f32> {
+        let [inverse, confidence] = self.inverse_depth(pixel);
+        (confidence > 0.0).then(|| 1.0 / inverse)
+    }
+
     /// A map from inverse depths `[1/scene units]`, where values that are not positive and finite are unknown, and
     /// confidences. `None` if no depth is known. Depths below a 64th of the median count as unknown, so that a stray
     /// near value does not make all others coarse: one step of `inverse` is then at most 0.1 % of the median depth.

@@ -39,6 +39,12 @@ pub struct Window {
 pub type SharedImage = Arc<Image8>;
 
 impl Image8 {
+    /// A black image.
+    pub fn black(width: u32, height: u32) -> Self {
+        let rgb = vec![0; 3 * width as usize * height as usize];
+        Self { width, height, rgb, alpha: None, mask: None }
+    }
+
     /// The colour of a pixel over `background`, in `[0, 1]`.
     pub fn composited(&self, x: usize, y: usize, background: [f32; 3]) -> [f32; 3] {
         let pixel = y * self.width as usize + x;

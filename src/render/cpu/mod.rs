@@ -56,8 +56,8 @@ use pulp::Arch;
 use super::candidates::{Candidates, Photograph, error_weights};
 use super::signals::{Field, counts_dominant};
 use super::{
-    AuxInput, AuxOutput, Backend, BackendError, Inspect, NonFinite, Rendering, RowWeights, Setup,
-    Shortcuts, StateArray, StateError, StepInput, StepOutput, SurfaceDepths, Tensor, assert_fits,
+    AuxInput, AuxOutput, Backend, BackendError, Inspect, NonFinite, Rendering, Setup, Shortcuts,
+    StateArray, StateError, StepInput, StepOutput, SurfaceDepths, Tensor, assert_fits,
     assert_same_size,
 };
 pub(crate) use adam::BiasCorrection;
@@ -233,7 +233,7 @@ impl CpuBackend {
         let exposure_gradient =
             exposure.map(|exposure| self.exposure_bwd(&frame.grid, exposure, background));
         if let Some((request, count)) = picks {
-            let photograph = Photograph { target, background, exposure };
+            let photograph = Photograph::from(input);
             self.collect_candidates(&frame, photograph, &request, count);
         }
         let (layout, depth) = self.backward_with_depth(&frame, depth);
@@ -403,13 +403,5 @@ impl Inspect for CpuBackend {
 
     fn render_depths(&mut self, camera: &Camera) -> Result<SurfaceDepths, BackendError> {
         self.depths_of_view(camera)
-    }
-
-    fn weights_in_front(
-        &mut self,
-        camera: &Camera,
-        surface: &[f32],
-    ) -> Result<Vec<RowWeights>, BackendError> {
-        self.weights_in_view(camera, surface)
     }
 }

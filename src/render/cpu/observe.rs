@@ -19,6 +19,7 @@ use super::rasterize::{
 use super::records::{Sums, TileRecords, gather_all, parts};
 use super::replay::{Blended, blend, is_finished};
 use super::simd::{V, WIDTH};
+use super::surface::MEDIAN;
 use super::tiles::{Entry, Grid, Visible};
 use super::{AuxInput, AuxOutput, BackendError, CpuBackend};
 use crate::assert_same_size;
@@ -27,12 +28,14 @@ use crate::pixel_map::{pixel_map, radius_px, sample_pixels};
 use densify_core::image::Image8;
 
 /// Values per record: sum of the pixel map, number of pixels, sum of blend weights, sum of the pixels' distances from
-/// the projected mean, largest weight.
-const STRIDE: usize = 5;
+/// the projected mean, sum of blend weights in front of the surface, largest weight.
+const STRIDE: usize = 6;
 /// The index of the largest weight, the only value that is not a sum.
 const MAXIMUM: usize = STRIDE - 1;
-/// The plane of a tile's gradient that temporarily holds the pixel map.
+/// The planes of a tile's gradient that temporarily hold the pixel map, and the depth below which a row is in front of
+/// the surface.
 const MAP: usize = 3;
+const FRONT: usize = 2;
 
 /// Bytes for an image of `pixels` pixels: colours, error, edge and luma, and the sampling of points.
 pub(super) fn bytes(request: &AuxRequest, pixels: usize) -> u64 {
@@ -62,9 +65,12 @@ impl CpuBackend {
                 Vec::new()
             } else {
                 self.write_map(&frame.grid, target, background, request.map);
+                if request.columns.contains(&AuxColumn::WeightInFront) {
+                    self.write_front(&frame, input);
+                }
                 let columns = self.columns(&frame, &request.columns);
                 for gradient in &mut self.gradient {
-                    gradient.planes[MAP] = ZERO_PLANE;
+                    (gradient.planes[MAP], gradient.planes[FRONT]) = (ZERO_PLANE, ZERO_PLANE);
                 }
                 columns
             };
@@ -87,8 +93,7 @@ impl CpuBackend {
             });
         }
         let pixels = sample_pixels(&alpha, grid.width, input);
-        let AuxInput { target, background, exposure, .. } = *input;
-        let photograph = Photograph { target, background, exposure };
+        let photograph = Photograph::from(input);
         self.surface_points(frame, photograph, &pixels, DepthMode::MaxWeight)
     }
 
@@ -105,6 +110,20 @@ impl CpuBackend {
             gradient.planes[MAP] = ZERO_PLANE;
             for_each_pixel(grid, tile, |patch, lane, at| {
                 gradient.planes[MAP][patch][lane] = values[at];
+            });
+        }
+    }
+
+    /// Writes the depth below which a row is in front of the surface to its plane of the gradient. Overwrites the image.
+    fn write_front(&mut self, frame: &Frame, input: &AuxInput<'_>) {
+        self.replay_depths(frame);
+        let grid = &frame.grid;
+        let tiles = self.gradient.iter_mut().zip(&self.canvas);
+        for (tile, (gradient, canvas)) in tiles.take(grid.tiles()).enumerate() {
+            for_each_pixel(grid, tile, |patch, lane, at| {
+                let median = canvas.planes[MEDIAN][patch][lane];
+                let surface = input.depth.and_then(|map| map.known_depth(at)).unwrap_or(median);
+                gradient.planes[FRONT][patch][lane] = surface * (1.0 - input.request.margin);
             });
         }
     }
@@ -137,6 +156,7 @@ impl CpuBackend {
                             place: TilePlace::new(grid, tile),
                             blending,
                             map: &gradient[tile].planes[MAP],
+                            front: &gradient[tile].planes[FRONT],
                             records: part.records(lists, i, records, STRIDE),
                             batch,
                         });
@@ -156,6 +176,7 @@ impl CpuBackend {
             AuxColumn::PixelCount => sums[row * STRIDE + 1],
             AuxColumn::WeightSum => sums[row * STRIDE + 2],
             AuxColumn::DistanceSum => sums[row * STRIDE + 3],
+            AuxColumn::WeightInFront => sums[row * STRIDE + 4],
             AuxColumn::WeightMax => sums[row * STRIDE + MAXIMUM],
             AuxColumn::DominantPixels => dominant[row].load(Relaxed) as f32,
             AuxColumn::Depth => splats[row].depth,
@@ -181,6 +202,7 @@ struct Replay<'a> {
     /// The settings of the forward pass.
     blending: Blending,
     map: &'a Plane,
+    front: &'a Plane,
     /// The records of this tile's entries; only entries in the current [`Part`](super::records::Part) have one.
     records: TileRecords<'a>,
     /// Scratch.
@@ -192,7 +214,7 @@ impl WithSimd for Replay<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, s: S) {
-        let Self { splats, list, place, blending, map, records, batch } = self;
+        let Self { splats, list, place, blending, map, front, records, batch } = self;
         let c = |x: f32| V::splat(s, x);
         let zero = V::zero(s);
         let (mut transmittance, mut unfinished) = place.inside();
@@ -216,6 +238,8 @@ impl WithSimd for Replay<'_> {
                         sums[1] = sums[1] + blends.keep(c(1.0));
                         sums[2] = sums[2] + weight;
                         sums[3] = sums[3] + blends.keep(distance);
+                        let in_front = c(splat.depth).lt(V::load(s, &front[p][at..]));
+                        sums[4] = sums[4] + in_front.keep(weight);
                         sums[MAXIMUM] = sums[MAXIMUM].max(weight);
                     }
                     if is_finished(&transmittance[p]) {

@@ -300,10 +300,14 @@ impl CpuBackend {
                     }
                     let at = [x as f32 + 0.5, y as f32 + 0.5];
                     let list = lists.of_tile(tile(x, y) - band.start);
-                    let surface = candidates::surface_row(splats, list, at, shortcuts, mode)
-                        .and_then(|row| candidates::closest_approach(params, row, view, at));
+                    let rendered = || {
+                        candidates::surface_row(splats, list, at, shortcuts, mode)
+                            .and_then(|row| candidates::closest_approach(params, row, view, at))
+                            .map(|(position, depth)| (position.to_array(), depth))
+                    };
+                    let surface = photograph.given_point(x, y).or_else(rendered);
                     *point = surface.map(|(position, depth)| Candidate {
-                        position: position.to_array(),
+                        position,
                         colour: colour(x, y),
                         pixel_size: depth / focal,
                         error,

@@ -230,6 +230,8 @@ pub(super) fn rebound(sizes: &Sizes) -> HashMap<&'static str, Vec<Vec<Rebinding>
         ("present", vec![vec![("signals", "sums")]]),
         // Borrows the sums of the rows, which are unused before the backward pass.
         ("surface", vec![vec![("pixels", "ops"), ("points", "row sums")]]),
+        // The second quarter of the canvas, which the host has read.
+        ("find_front", vec![vec![("depths", "canvas")]]),
         ("count_errors", two(&|i| vec![("map", ERROR_MAPS[i])])),
         ("write_worst", two(&|i| vec![("map", ERROR_MAPS[i])])),
         // Borrows the canvas, which the host has read.

@@ -9,7 +9,7 @@ use densify_policies::policy::{
 
 use super::GpuBackend;
 use super::frame::Frame;
-use super::passes::{ErrorPlace, Search, Shape};
+use super::passes::{COLUMNS, ErrorPlace, Search, Shape};
 use super::rows::{DEPTH, SPLAT};
 use super::sizes::OPS_BYTES;
 use crate::candidates::{Photograph, count_to_rank};
@@ -153,9 +153,10 @@ impl GpuBackend {
             for (&(x, y, error), &[px, py, pz, depth]) in
                 chunk.iter().zip(points.as_chunks::<4>().0)
             {
-                if depth > 0.0 {
+                let rendered = (depth > 0.0).then_some(([px, py, pz], depth));
+                if let Some((position, depth)) = photograph.given_point(x, y).or(rendered) {
                     found.push(Candidate {
-                        position: [px, py, pz],
+                        position,
                         colour: colour(x, y),
                         pixel_size: depth / focal,
                         error,
@@ -183,7 +184,7 @@ impl GpuBackend {
         })?;
         let loss = state.output().loss;
         let image = self.rendering(camera.width, camera.height, exposure.is_some())?;
-        let photograph = Photograph { target, background, exposure };
+        let photograph = Photograph::from(input);
         let rendered = RenderedView { frame, shape, photograph };
         let points = if request.points == 0 {
             Vec::new()
@@ -196,7 +197,18 @@ impl GpuBackend {
         } else {
             let map = pixel_map(image.rgb.as_chunks::<3>().0, target, background, request.map);
             self.write("canvas", bytemuck::cast_slice(&map));
+            let in_front = request.columns.contains(&AuxColumn::WeightInFront);
+            if in_front {
+                // Depths follow the map in the same buffer; 0: the device is to find the model's own.
+                let known = |pixel| input.depth.and_then(|map| map.known_depth(pixel));
+                let given: Vec<f32> =
+                    (0..map.len()).map(|pixel| known(pixel).unwrap_or(0.0)).collect();
+                self.write_at("canvas", 4 * map.len() as u64, &given);
+            }
             self.continue_view(shape, |passes, to| {
+                if in_front {
+                    passes.fronts(to, map.len() as u32, 1.0 - request.margin);
+                }
                 passes.columns(to);
             });
             self.columns(request)?
@@ -207,7 +219,7 @@ impl GpuBackend {
     /// Reads the columns that the last passes have computed.
     fn columns(&self, request: &AuxRequest) -> Result<Vec<(AuxColumn, Vec<f32>)>, BackendError> {
         let n = self.rows as u64;
-        let sums = self.read("row sums", 0, 20 * n)?;
+        let sums = self.read("row sums", 0, (4 * COLUMNS) as u64 * n)?;
         let splats = self.read("splats", 0, (4 * SPLAT) as u64 * n)?;
         let counted = if self.sizes.counts_dominant { n } else { 0 };
         let dominant = self.read("dominant", 0, 4 * counted)?;
@@ -217,11 +229,12 @@ impl GpuBackend {
                 return 0.0;
             }
             match column {
-                AuxColumn::MapSum => sums[5 * row],
-                AuxColumn::PixelCount => sums[5 * row + 1],
-                AuxColumn::WeightSum => sums[5 * row + 2],
-                AuxColumn::DistanceSum => sums[5 * row + 3],
-                AuxColumn::WeightMax => sums[5 * row + 4],
+                AuxColumn::MapSum => sums[COLUMNS * row],
+                AuxColumn::PixelCount => sums[COLUMNS * row + 1],
+                AuxColumn::WeightSum => sums[COLUMNS * row + 2],
+                AuxColumn::DistanceSum => sums[COLUMNS * row + 3],
+                AuxColumn::WeightInFront => sums[COLUMNS * row + 4],
+                AuxColumn::WeightMax => sums[COLUMNS * row + 5],
                 AuxColumn::DominantPixels => dominant[row].to_bits() as f32,
                 AuxColumn::Depth => splat[DEPTH],
                 AuxColumn::Radius => {

@@ -36,7 +36,7 @@ const TO_ORDER: usize = 4;
 const WHOLE: u32 = u32::MAX;
 
 /// Numbers that an auxiliary view sums per row.
-const COLUMNS: u32 = 5;
+pub(super) const COLUMNS: usize = 6;
 
 /// The sizes that determine the commands.
 #[derive(Debug, Clone, Copy)]
@@ -347,12 +347,23 @@ impl<L> Passes<'_, L> {
         }
     }
 
+    /// Completes the depths that follow the pixel map with those of the model, and multiplies all by `factor`.
+    pub(super) fn fronts(&self, to: &mut impl Record<L>, pixels: u32, factor: f32) {
+        for band in 0..self.shape.bands {
+            if self.shape.bands > 1 {
+                self.lists(to, band, COUNTS_AGAIN);
+            }
+            let immediates = [band, pixels, factor.to_bits(), 0];
+            to.run(self.launches.get("find_front"), immediates, pixels.div_ceil(256));
+        }
+    }
+
     /// Computes the columns of an auxiliary view: for each row, sums over the pixels that it is blended into.
     pub(super) fn columns(&self, to: &mut impl Record<L>) {
         let l = self.launches;
         let groups = self.shape.rows.div_ceil(256);
         if !l.in_slots {
-            to.run(l.get("clear_sums"), [COLUMNS, 0, 0, 0], groups);
+            to.run(l.get("clear_sums"), [COLUMNS as u32, 0, 0, 0], groups);
         }
         for band in 0..self.shape.bands {
             if self.shape.bands > 1 {

@@ -100,7 +100,7 @@ impl GpuBackend {
                     passes.worst(to, search);
                 }
             })?;
-            let photograph = Photograph { target, background, exposure };
+            let photograph = Photograph::from(input);
             let rendered = RenderedView { frame, shape, photograph };
             self.collect_candidates(&rendered, &request, count, search)?;
             self.continue_view(shape, step);

@@ -24,7 +24,7 @@ use densify_core::memory::Ledger;
 use densify_core::spelling::Spelling;
 use densify_train::exposure::ExposureChoice;
 use densify_train::schedule::Background;
-use densify_train::trainer::{AutoChoices, growth_signals};
+use densify_train::trainer::{AutoChoices, FLOATER_BYTES, floater_request, growth_signals};
 
 /// Maximum number of random initial points without `--init-points` (Kerbl et al. 2023 use 100,000).
 const RANDOM_POINTS: usize = 100_000;
@@ -315,7 +315,14 @@ impl<'a> Case<'a> {
         } else {
             needs.signals
         };
-        Needs { signals, ..needs }
+        if !self.spec.depth.remove_floaters {
+            return Needs { signals, ..needs };
+        }
+        let own = floater_request();
+        let mut aux = needs.aux.clone().unwrap_or_default();
+        aux.columns.extend(own.columns);
+        let scratch_bytes = needs.scratch_bytes + FLOATER_BYTES;
+        Needs { signals, aux: Some(aux), scratch_bytes, ..needs }
     }
 }
 

@@ -136,6 +136,7 @@ fn train_options(run: &ResolvedRun<'_>, rates: RateOptions) -> TrainOptions {
         on_nan: schedule.on_nan,
         depth: case.inputs.dataset.depth.as_ref().and_then(|_| depth.training()),
         distortion: depth.distortion(),
+        removes_floaters: depth.remove_floaters,
     }
 }
 

@@ -239,6 +239,10 @@ run_spec! {
         /// Weight of a term that gathers the Gaussians along each ray, after a third of the run; needs no given depth
         /// (default: 0)
         distortion_weight: Option<Weight> = None, Fixed, value "WEIGHT";
+
+        /// Prune Gaussians with most of their weight in front of the surface, after the first three tenths of the run; the
+        /// policy grows others. The surface is the given depth, or else the model's own median depth
+        remove_floaters: bool = false, Fixed, switch Set;
     }
 
     /// Limits of memory and quality.

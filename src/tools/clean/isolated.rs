@@ -9,7 +9,7 @@ use densify_core::gaussians::Gaussians;
 use densify_data::dataset::normalise::Normalisation;
 use glam::{DQuat, DVec3};
 
-use super::weights::Weights;
+use densify_train::in_front::RowWeights;
 
 /// Side of a cell, in radii of the sphere around four fifths of the Gaussians.
 const CELL: f64 = 1.0 / 32.0;
@@ -32,7 +32,7 @@ struct Cells {
 pub(super) fn find(
     model: &Gaussians,
     rows: &[usize],
-    weights: &[Weights],
+    weights: &[RowWeights],
     limit: f64,
 ) -> Vec<usize> {
     let to_unit = Normalisation::fit_model(model);
@@ -146,7 +146,7 @@ mod tests {
             let places = [&line, others].concat();
             let model = at(&places, log_scale);
             let rows: Vec<usize> = (0..places.len()).collect();
-            let weights = vec![Weights { in_front: 0.0, whole: 1.0 }; places.len()];
+            let weights = vec![RowWeights { in_front: 0.0, whole: 1.0 }; places.len()];
             find(&model, &rows, &weights, 5.0)
         };
         assert_eq!(isolated(&[[0.0, 0.2, 0.0]], -7.0), [200]);

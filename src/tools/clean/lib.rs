@@ -30,7 +30,7 @@ pub struct Options<'a> {
     pub model: TrainedModel,
     /// Antialiasing of the model; `None`: as its file states.
     pub antialias: Option<Antialiasing>,
-    /// Device to measure PSNR and to train on. Weights are measured on the processor.
+    /// Device to measure and to train on.
     pub device: DeviceSpec,
     /// The rules.
     pub rules: Rules,
@@ -79,7 +79,10 @@ pub fn clean(options: &Options<'_>, observer: &dyn Observer) -> Result<Cleaned, 
     let mut stages = vec![(model.len(), before)];
     let mut rounds = Vec::new();
     for _ in 0..options.rounds {
-        let weights = weights::measure(&model, (&dataset, near), options, observer)?;
+        let weights = {
+            let margin = options.rules.margin;
+            weights::measure(&model, (&dataset, near), margin, &machine, observer)?
+        };
         let (kept, removed) = rules::apply(&model, &weights, &options.rules);
         if kept.is_empty() {
             return Err(Failure::input(

@@ -4,10 +4,7 @@ use densify_core::gaussians::Gaussians;
 use glam::DVec3;
 
 use super::isolated;
-use super::weights::Weights;
-
-/// Share of a Gaussian's weight in front of the surface above which it is removed.
-const MOSTLY: f64 = 0.5;
+use densify_train::in_front::RowWeights;
 
 /// A rule. Each Gaussian counts for the first one that removes it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -57,21 +54,20 @@ pub struct Removed {
 /// Applies the rules once. Returns the rows to keep, and what each rule removes.
 pub(super) fn apply(
     model: &Gaussians,
-    weights: &[Weights],
+    weights: &[RowWeights],
     rules: &Rules,
 ) -> (Vec<usize>, Vec<Removed>) {
     let mut broken: Vec<Option<Rule>> = (0..model.len())
         .map(|row| {
-            let Weights { in_front, whole } = weights[row];
             let is_outside = rules.keep_box.is_some_and(|(low, high)| {
                 let place = DVec3::from(model.position(row));
                 !(place.cmpge(low).all() && place.cmple(high).all())
             });
             if is_outside {
                 Some(Rule::OutsideBox)
-            } else if rules.unseen && whole <= 0.0 {
+            } else if rules.unseen && weights[row].whole <= 0.0 {
                 Some(Rule::Unseen)
-            } else if rules.in_front && in_front > MOSTLY * whole {
+            } else if rules.in_front && weights[row].is_floater() {
                 Some(Rule::InFront)
             } else {
                 None
@@ -114,9 +110,9 @@ mod tests {
         model
     }
 
-    fn removed(rules: &Rules, change: impl Fn(&mut Vec<Weights>)) -> (Vec<usize>, Vec<Removed>) {
-        let mut weights = vec![Weights { in_front: 0.0, whole: 1.0 }; 103];
-        weights[100..].fill(Weights { in_front: 0.0, whole: 0.2 });
+    fn removed(rules: &Rules, change: impl Fn(&mut Vec<RowWeights>)) -> (Vec<usize>, Vec<Removed>) {
+        let mut weights = vec![RowWeights { in_front: 0.0, whole: 1.0 }; 103];
+        weights[100..].fill(RowWeights { in_front: 0.0, whole: 0.2 });
         change(&mut weights);
         apply(&model(), &weights, rules)
     }
@@ -124,9 +120,9 @@ mod tests {
     #[test]
     fn each_rule_removes_its_own() {
         let (kept, gone) = removed(&RULES, |weights| {
-            weights[3] = Weights { in_front: 0.6, whole: 1.0 };
-            weights[4] = Weights { in_front: 0.5, whole: 1.0 };
-            weights[7] = Weights::default();
+            weights[3] = RowWeights { in_front: 0.6, whole: 1.0 };
+            weights[4] = RowWeights { in_front: 0.5, whole: 1.0 };
+            weights[7] = RowWeights::default();
         });
         let total = 99.0 + 0.6;
         let share = |rule: Rule| {
@@ -147,7 +143,7 @@ mod tests {
         let off = Rules { unseen: false, in_front: false, isolated: 0.0, ..RULES };
         let (kept, gone) = removed(&off, |weights| {
             weights[3].in_front = 1.0;
-            weights[7] = Weights::default();
+            weights[7] = RowWeights::default();
         });
         assert_eq!((kept.len(), gone.len()), (103, 0));
         let keep_box = Some((DVec3::new(0.105, -1.0, -1.0), DVec3::new(0.205, 1.0, 1.0)));

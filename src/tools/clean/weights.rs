@@ -2,23 +2,16 @@
 //! that of the dataset's depth maps.
 
 use densify_core::gaussians::Gaussians;
+use densify_core::image::Image8;
 use densify_data::dataset::Dataset;
 use densify_data::views::ViewSource;
-use densify_render::BackendChoice;
+use densify_policies::policy::Needs;
+use densify_render::AuxInput;
 use densify_run::failure::Failure;
 use densify_run::finished::{Machine, views_of};
-use densify_run::{DeviceSpec, Observer, Silent, check_interrupt};
+use densify_run::{Observer, check_interrupt};
 use densify_train::evaluate::Split;
-
-use super::Options;
-
-/// Blend weights α·T summed over the pixels of all training views.
-#[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub(super) struct Weights {
-    /// The part in pixels whose median depth is farther than the Gaussian by more than the margin.
-    pub(super) in_front: f64,
-    pub(super) whole: f64,
-}
+use densify_train::in_front::{self, RowWeights};
 
 /// Measures the weights of each Gaussian of a model in the coordinates of the dataset. Shape of the result: `[rows]`.
 ///
@@ -27,26 +20,32 @@ pub(super) struct Weights {
 pub(super) fn measure(
     model: &Gaussians,
     (dataset, near): (&Dataset, f32),
-    options: &Options<'_>,
+    margin: f64,
+    machine: &Machine,
     observer: &dyn Observer,
-) -> Result<Vec<Weights>, Failure> {
-    let device = DeviceSpec { backend: BackendChoice::Cpu, gpu: None, ..options.device.clone() };
-    let machine = Machine::open(&device, &Silent)?;
-    let mut backend = machine.backend(dataset, model.clone(), near)?;
-    let inspect = backend.inspect()?;
+) -> Result<Vec<RowWeights>, Failure> {
+    let request = in_front::request(margin as f32);
+    let needs = Needs { aux: Some(request.clone()), ..Needs::default() };
+    let mut backend = machine.backend_for(dataset, model.clone(), near, needs)?;
     let views = views_of(dataset, Split::Train)?;
-    let mut sums = vec![Weights::default(); model.len()];
-    let nearer = 1.0 - options.rules.margin as f32;
+    let mut sums = vec![RowWeights::default(); model.len()];
     for view in 0..views.count() {
         check_interrupt(observer)?;
         let camera = views.camera(view);
-        let mut surface = inspect.render_depths(camera)?.median;
-        surface.iter_mut().for_each(|depth| *depth *= nearer);
-        let weights = inspect.weights_in_front(camera, &surface)?;
-        for (sum, weights) in sums.iter_mut().zip(weights) {
-            sum.in_front += f64::from(weights.in_front);
-            sum.whole += f64::from(weights.whole);
-        }
+        let measured = backend.observe(&AuxInput {
+            step: 0,
+            view,
+            seed: 0,
+            camera,
+            // Weights do not depend on the photograph.
+            target: &Image8::black(camera.width, camera.height),
+            background: [0.0; 3],
+            exposure: None,
+            sh_degree: 0,
+            depth: None,
+            request: &request,
+        })?;
+        in_front::add(&mut sums, &measured);
     }
     Ok(sums)
 }

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use glam::{DMat3, DVec3};
 
-use super::picture_kind::PictureKind::{RowAge, RowEdit, RowGradient, RowWeight};
+use super::picture_kind::PictureKind::{RowAge, RowEdit, RowGradient, RowInFront, RowWeight};
 use super::scene::{LoadedScene, ModelInfo, NO_MODEL, Scene};
 use densify_core::antialiasing::Antialiasing;
 use densify_core::camera_path::Keyframe;
@@ -238,7 +238,7 @@ fn scene_of_points(
     let name = format!("{}: {kind}", name_of(path));
     let mut loaded = scene_of_dataset(machine, path, dataset, data);
     loaded.add_model_in_scene(name, &model, near, None)?;
-    loaded.scene.mark_unavailable(&[RowGradient, RowWeight, RowAge, RowEdit], NO_MODEL);
+    loaded.scene.mark_unavailable(&[RowGradient, RowWeight, RowInFront, RowAge, RowEdit], NO_MODEL);
     Ok(loaded)
 }
 

@@ -30,6 +30,8 @@ pub(super) enum PictureKind {
     RowGradient,
     /// Gaussians coloured by their largest blend weight.
     RowWeight,
+    /// Gaussians coloured by the share of their weight in front of the surface.
+    RowInFront,
     /// Gaussians coloured by the steps since their creation.
     RowAge,
     /// Gaussians coloured by the steps since their last edit.
@@ -49,7 +51,7 @@ pub(super) struct Legend {
 }
 
 impl PictureKind {
-    pub(super) const ALL: [Self; 14] = [
+    pub(super) const ALL: [Self; 15] = [
         Self::Render,
         Self::Photograph,
         Self::Difference,
@@ -62,6 +64,7 @@ impl PictureKind {
         Self::RowShape,
         Self::RowGradient,
         Self::RowWeight,
+        Self::RowInFront,
         Self::RowAge,
         Self::RowEdit,
     ];
@@ -74,6 +77,11 @@ impl PictureKind {
     /// True if Gaussians are rendered in colours other than their own.
     pub(super) fn colours_rows(self) -> bool {
         self >= Self::Rows
+    }
+
+    /// True if the training views of a finished model are needed to measure the number that the picture shows.
+    pub(super) fn is_measured(self) -> bool {
+        matches!(self, Self::RowGradient | Self::RowWeight | Self::RowInFront)
     }
 
     pub(super) fn legend(self) -> Legend {
@@ -132,6 +140,12 @@ impl PictureKind {
                 "Every Gaussian coloured by its largest weight in any pixel of the training views; dark ones are \
                 hardly visible anywhere.",
                 Some("weight"),
+            ),
+            Self::RowInFront => (
+                "Weight in front of the surface",
+                "Every Gaussian coloured by the share of its weight that is in front of the surface, the model's own \
+                median depth, in the training views; floaters are bright, and densify clean removes them.",
+                Some("share"),
             ),
             Self::RowAge => (
                 "Age of Gaussians",

@@ -52,7 +52,7 @@ pub(super) fn render(
     let begun = Instant::now();
     let ModelCache { colours: kept, measurements, edits } = cache;
     let mut progress = None;
-    if matches!(request.kind, PictureKind::RowGradient | PictureKind::RowWeight) {
+    if request.kind.is_measured() {
         let model = &scene.models[request.model];
         let measurements = match measurements {
             Some(measurements) => measurements,

@@ -152,6 +152,11 @@ pub(super) fn colour_rows(
             };
             ScaledValues::linear(values, Scale::Unit)
         }
+        PictureKind::RowInFront => {
+            let values = row_data.measurements.map(RowMeasurements::shares_in_front);
+            let values = values.unwrap_or_else(|| vec![0.0; backend.rows()]);
+            ScaledValues::linear(values, Scale::Unit)
+        }
         PictureKind::RowAge | PictureKind::RowEdit => {
             let steps = row_data.history.map_or(&[][..], |(history, _)| match kind {
                 PictureKind::RowAge => history.created(),
@@ -255,6 +260,7 @@ mod tests {
             (PictureKind::RowShape, 1.0..32.0),
             (PictureKind::RowGradient, 1e-5..1e-3),
             (PictureKind::RowWeight, 0.0..1.0),
+            (PictureKind::RowInFront, 0.0..1.0),
             (PictureKind::RowEdit, 0.0..10.0),
         ] {
             let colours = colour_rows(kind, backend.as_mut(), row_data, UNITS).unwrap();

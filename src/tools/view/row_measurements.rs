@@ -9,9 +9,10 @@ use densify_policies::policy::{Cadence, LossTerms, Needs, Signal, SignalSet};
 
 use super::scene::{ModelInfo, Scene};
 use densify_data::views::ViewSource;
-use densify_render::{Backend, LearningRates, StepInput};
+use densify_render::{AuxInput, Backend, LearningRates, StepInput};
 use densify_run::failure::Failure;
 use densify_train::evaluate::Split;
+use densify_train::in_front::{self, MARGIN, RowWeights};
 use densify_train::schedule::view_order;
 
 /// The measured signals.
@@ -29,6 +30,8 @@ pub(super) struct RowMeasurements {
     pub(super) gradient: Vec<f32>,
     /// Largest weight in any pixel, in `[0, 1]`. Shape: `[rows]`.
     pub(super) weight: Vec<f32>,
+    /// Weights in front of the surface, and whole ones. Shape: `[rows]`.
+    in_front: Vec<RowWeights>,
 }
 
 impl std::fmt::Debug for RowMeasurements {
@@ -45,7 +48,8 @@ impl RowMeasurements {
         model: &ModelInfo,
         backend: &dyn Backend,
     ) -> Result<Self, Failure> {
-        let needs = Needs { signals: SIGNALS.into(), ..Needs::default() };
+        let aux = Some(in_front::request(MARGIN));
+        let needs = Needs { signals: SIGNALS.into(), aux, ..Needs::default() };
         let gaussians = backend.download()?;
         let mut backend = scene.machine.backend_to_measure(&gaussians, model.near, needs)?;
         backend.begin_epoch();
@@ -56,6 +60,7 @@ impl RowMeasurements {
             seen: 0,
             gradient: vec![0.0; rows],
             weight: vec![0.0; rows],
+            in_front: vec![RowWeights::default(); rows],
         })
     }
 
@@ -94,6 +99,19 @@ impl RowMeasurements {
                 seed: 0,
             };
             backend.train_step(&input)?;
+            let measured = backend.observe(&AuxInput {
+                step: input.step,
+                view,
+                seed: 0,
+                camera: input.camera,
+                target: &image,
+                background: scene.background,
+                exposure: None,
+                sh_degree,
+                depth: None,
+                request: &in_front::request(MARGIN),
+            })?;
+            in_front::add(&mut self.in_front, &measured);
             self.seen += 1;
             if begun.elapsed() >= duration {
                 break;
@@ -110,10 +128,20 @@ impl RowMeasurements {
         Ok(())
     }
 
-    /// Completed measurements with these values.
+    /// The share of each Gaussian's weight that is in front of the surface, in `[0, 1]`. Shape: `[rows]`.
+    pub(super) fn shares_in_front(&self) -> Vec<f32> {
+        self.in_front.iter().map(|weights| weights.share() as f32).collect()
+    }
+
+    /// Completed measurements with these values; the share of each row in front of the surface is its weight.
     #[cfg(test)]
     pub(super) fn from_values(gradient: Vec<f32>, weight: Vec<f32>) -> Self {
-        Self { backend: None, order: Vec::new(), seen: 0, gradient, weight }
+        let in_front = |&weight: &f32| RowWeights {
+            in_front: f64::from(weight * weight),
+            whole: weight.into(),
+        };
+        let in_front = weight.iter().map(in_front).collect();
+        Self { backend: None, order: Vec::new(), seen: 0, gradient, weight, in_front }
     }
 }
 
@@ -175,6 +203,7 @@ mod tests {
         let before = (measured.weight.clone(), measured.gradient.clone());
         measured.measure_more(&scene, 0, Duration::ZERO).expect("nothing to do");
         assert_eq!((&measured.weight, &measured.gradient), (&before.0, &before.1));
+        assert_eq!(measured.shares_in_front(), [0.0; 2]);
         let weights = &measured.weight;
         assert!(weights.iter().all(|weight| (0.5..=1.0).contains(weight)), "{weights:?}");
     }

@@ -23,6 +23,8 @@ const NO_CREATION: &str =
     "model files do not store when a Gaussian was created; densify train --view shows it";
 const NO_EDITS: &str = "only a run's checkpoint stores when a Gaussian was edited, and this model has none; \
 densify train --view shows it";
+const NO_SURFACE: &str =
+    "it is not measured during training; densify view does, once a model is saved";
 const NO_PHOTOGRAPHS: &str = "there are no photographs; name their dataset with --scene";
 const NO_TRAINING_VIEWS: &str =
     "it is measured in training photographs, and there are none; name their dataset with --scene";
@@ -111,7 +113,7 @@ impl Scene {
         scene.mark_unavailable(&[PictureKind::RowAge], NO_CREATION);
         if scene.views[1].is_empty() {
             scene.mark_unavailable(
-                &[PictureKind::RowGradient, PictureKind::RowWeight],
+                &[PictureKind::RowGradient, PictureKind::RowWeight, PictureKind::RowInFront],
                 NO_TRAINING_VIEWS,
             );
         }
@@ -174,6 +176,7 @@ impl Scene {
         if !counts {
             scene.mark_unavailable(&[PictureKind::Count], NO_COUNTS);
         }
+        scene.mark_unavailable(&[PictureKind::RowInFront], NO_SURFACE);
         let unmeasured = format!(
             "the policy {policy} does not measure it; densify view does, once a model is saved"
         );

@@ -95,8 +95,7 @@ fn point_in_view(draw: &mut UniformRng, cameras: &[Camera], (near, far): (f64, f
     let pixel =
         DVec2::new(draw.unit() * f64::from(camera.width), draw.unit() * f64::from(camera.height));
     let depth = 1.0 / (1.0 / far + draw.unit() * (1.0 / near - 1.0 / far));
-    let ray = DVec3::new((pixel.x - camera.cx) / camera.fx, (pixel.y - camera.cy) / camera.fy, 1.0);
-    camera.rotation.transpose() * (depth * ray - camera.translation)
+    camera.unproject(pixel, depth)
 }
 
 /// A generator of uniform random numbers.

@@ -8,6 +8,7 @@ mod auto_budget;
 mod depth;
 mod edit;
 mod error;
+mod floaters;
 mod near_duplicates;
 mod nonfinite;
 mod options;
@@ -36,6 +37,7 @@ use depth::distortion;
 pub use depth::{Annealed, DepthTraining};
 use error::AtStep;
 pub use error::TrainError;
+pub use floaters::{FLOATER_BYTES, floater_request};
 use near_duplicates::distinct_views;
 use nonfinite::AUDIT_EVERY;
 pub use options::{AutoChoices, OnNan, TrainOptions};
@@ -186,6 +188,7 @@ impl<V: ViewSource> Trainer<V> {
         if is_due || step.is_multiple_of(AUDIT_EVERY) || step == iterations {
             events.extend(self.remove_nonfinite(step)?);
         }
+        events.extend(self.remove_floaters(step)?);
         events.extend(self.update_auto_budget(step)?);
         let start = Instant::now();
         if is_due {

@@ -32,6 +32,8 @@ pub struct TrainOptions {
     /// Weight of the [distortion term](densify_render::StepInput::distortion) after a third of the run, >= 0; requires
     /// a backend set up for depth unless it is 0.
     pub distortion: f32,
+    /// Remove floaters at tenths of the run; requires a backend [for it](super::floater_request).
+    pub removes_floaters: bool,
 }
 
 /// Automatic choices from measurements of the scene.

@@ -20,7 +20,7 @@ impl<V: ViewSource> Trainer<V> {
         let (options, degree, frozen) =
             (self.options, self.sh_degree(step), self.row_budget().frozen);
         for view in self.sample_scored_views(count, step) {
-            let image = self.image(step, view)?;
+            let (image, depth) = self.image_with_depth(step, view)?;
             let exposure = self.state.exposures.as_ref().map(|exposures| exposures.transform(view));
             let measured = self.backend.observe(&AuxInput {
                 step,
@@ -31,6 +31,7 @@ impl<V: ViewSource> Trainer<V> {
                 background: options.background.at(options.seed, step),
                 exposure: exposure.as_ref(),
                 sh_degree: degree,
+                depth: depth.as_deref(),
                 request: &request,
             });
             let mut measured = measured.at(step)?;

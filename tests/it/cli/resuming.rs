@@ -147,6 +147,31 @@ fn every_policy_resumes_exactly_on_a_gpu() {
 }
 
 #[test]
+fn the_removal_of_floaters_resumes_exactly() {
+    let scene = Photographs::colmap_text();
+    let (root, whole) = scratch();
+    let flags = "--budget 2k --eval --remove-floaters --checkpoint-every 38";
+    train(scene.path(), &whole, 150, flags).ok();
+    let part = root.path().join("part");
+    copy_unfinished(&whole, &part, 150);
+    for later in [76, 114] {
+        std::fs::remove_file(checkpoint(&part, later)).expect("a checkpoint");
+    }
+    let outcome = train(scene.path(), &part, 150, &format!("{flags} --resume")).ok();
+    assert!(outcome.stdout.contains("from step 38"), "{}", outcome.stdout);
+    assert_same(&whole, &part, "floaters");
+    let steps: Vec<u64> = records(&whole.join("stats/events.jsonl"))
+        .iter()
+        .filter(|event| event["cause"] == "in front of the surface")
+        .map(|event| count(event, "step"))
+        .collect();
+    assert!(
+        steps.iter().any(|&step| step < 38) && steps.iter().any(|&step| step > 38),
+        "{steps:?}"
+    );
+}
+
+#[test]
 fn checkpoints_contain_all_state_that_lasts_between_steps() {
     let scene = Photographs::colmap_text();
     // Gradients accumulated between steps, several bands, random backgrounds, and a rising SH degree.

@@ -209,7 +209,7 @@ fn frames_match_the_images_of_render() {
     let kinds: Vec<&str> = all.filter_map(|kind| kind["kind"].as_str()).collect();
     // No file records the age of Gaussians, so that kind is listed as missing. Edits come from the checkpoint.
     let lacking = described["lacking"].as_array().expect("a list of missing kinds");
-    assert_eq!((kinds.len(), lacking.len()), (13, 1), "{described}");
+    assert_eq!((kinds.len(), lacking.len()), (14, 1), "{described}");
     assert_eq!(page.frame(&frame_request("row_age", "test", 0, SIZE)).status, 400);
     let mut seen: Vec<Vec<u8>> = Vec::new();
     for kind in kinds {
@@ -243,6 +243,8 @@ fn frames_match_the_images_of_render() {
     assert!(gradient == measured("row_gradient").2, "measuring did not stop");
     let (is_whole, _, weight) = measured("row_weight");
     assert!(is_whole && weight != gradient);
+    let (is_whole, _, in_front) = measured("row_in_front");
+    assert!(is_whole && in_front != weight && in_front != gradient);
     // Measuring has not changed the model.
     assert!(psnr(&page.frame(&frame_request("render", "test", 0, SIZE)).picture(), &first) > 99.0);
     #[cfg(unix)]

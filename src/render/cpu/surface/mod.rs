@@ -1,11 +1,8 @@
-//! The surface that the model shows in a view: median depth, the spread of depths along each ray, and the weight that
-//! each row has in front of a given surface.
+//! The surface that the model shows in a view: median depth, and the spread of depths along each ray.
 //!
-//! Blending is [replayed](super::replay). The first replay uses the canvas's colours, which nobody reads, for its
-//! results. The second one reads the surface from the image gradient's plane for depth, which is set to 0 afterwards,
-//! and writes one record per (row, tile).
+//! Blending is [replayed](super::replay). The results replace two of the canvas's colours, which nobody reads any more.
 
-use std::sync::atomic::{AtomicU32, AtomicU64, Ordering::Relaxed};
+use std::sync::atomic::AtomicU64;
 
 use pulp::{Simd, WithSimd};
 use rayon::prelude::*;
@@ -14,22 +11,18 @@ use super::batch::{BATCH, Batch};
 use super::passes::{Frame, for_each_pixel};
 use super::project::Splat;
 use super::rasterize::{
-    Blending, DEPTH, DepthPlane, PATCHES, Plane, TRANSMITTANCE, TileCanvas, TilePlace, ZERO_PLANE,
+    Blending, DEPTH, DepthPlane, PATCHES, TRANSMITTANCE, TileCanvas, TilePlace, ZERO_PLANE,
 };
-use super::rasterize_bwd::BY_DEPTH;
-use super::records::{Sums, TileRecords, gather_all, parts};
 use super::replay::{Blended, blend, is_finished};
 use super::simd::{V, WIDTH};
-use super::tiles::{Entry, Visible};
+use super::tiles::Visible;
 use super::{BackendError, CpuBackend};
-use crate::inspect::{RowWeights, SurfaceDepths};
+use crate::inspect::SurfaceDepths;
 use densify_core::camera::Camera;
 
-/// Planes of the canvas that hold the results.
-const MEDIAN: usize = 0;
+/// Planes of the canvas that hold the results: median depth, 0 where there is none, and Σ α·T·z².
+pub(super) const MEDIAN: usize = 0;
 const SQUARES: usize = 1;
-/// Values per record: weight in front of the surface, and whole weight.
-const STRIDE: usize = 2;
 
 impl CpuBackend {
     /// Renders the depths of a view.
@@ -41,25 +34,9 @@ impl CpuBackend {
         let clock = std::mem::take(&mut self.clock);
         let frame = self.forward(camera, [0.0; 3], 0, DepthPlane::Depth, None);
         self.clock = clock;
-        let Frame { grid, bands, .. } = &frame?;
-        let blending = self.shortcuts.into();
-        let Self { threads, arch, lists, splats, visible, canvas, rows, .. } = self;
-        let rows = *rows;
-        threads.install(|| {
-            let visible = &visible[..rows.div_ceil(WIDTH)];
-            for band in bands {
-                if bands.len() > 1 {
-                    let visible = Visible { splats: &splats[..rows], seen: visible };
-                    lists.refill(threads, visible, grid, band);
-                }
-                let tiles = canvas[band.clone()].par_iter_mut().enumerate();
-                threads.each_with("replay", tiles, Batch::new, |batch, (i, canvas)| {
-                    let place = TilePlace::new(grid, band.start + i);
-                    let list = lists.of_tile(i);
-                    arch.dispatch(Depths { splats, list, place, blending, canvas, batch });
-                });
-            }
-        });
+        let frame = frame?;
+        self.replay_depths(&frame);
+        let grid = &frame.grid;
         let pixels = grid.width * grid.height;
         let mut depths = SurfaceDepths {
             width: grid.width as u32,
@@ -86,29 +63,12 @@ impl CpuBackend {
         Ok(depths)
     }
 
-    /// Measures each row's weight in front of `surface` in a view. Shape: `[height, width]`; 0 where it is unknown.
-    pub(super) fn weights_in_view(
-        &mut self,
-        camera: &Camera,
-        surface: &[f32],
-    ) -> Result<Vec<RowWeights>, BackendError> {
-        let clock = std::mem::take(&mut self.clock);
-        let frame = self.forward(camera, [0.0; 3], 0, DepthPlane::Unused, None);
-        self.clock = clock;
-        let Frame { grid, bands, .. } = &frame?;
-        assert_eq!(surface.len(), grid.width * grid.height, "one depth per pixel");
-        for (tile, gradient) in self.gradient[..grid.tiles()].iter_mut().enumerate() {
-            gradient.planes[BY_DEPTH] = ZERO_PLANE;
-            for_each_pixel(grid, tile, |patch, lane, at| {
-                gradient.planes[BY_DEPTH][patch][lane] = surface[at];
-            });
-        }
+    /// Replaces the first two colours of the canvas by [`MEDIAN`] and [`SQUARES`].
+    pub(super) fn replay_depths(&mut self, frame: &Frame) {
+        let Frame { grid, bands, .. } = frame;
         let blending = self.shortcuts.into();
-        self.reserve_sums(self.signals.layout());
-        let Self { threads, arch, lists, splats, records, sums, visible, gradient, rows, .. } =
-            self;
+        let Self { threads, arch, lists, splats, visible, canvas, rows, .. } = self;
         let rows = *rows;
-        let sums = &mut sums[..rows * STRIDE];
         threads.install(|| {
             let visible = &visible[..rows.div_ceil(WIDTH)];
             for band in bands {
@@ -116,38 +76,14 @@ impl CpuBackend {
                     let visible = Visible { splats: &splats[..rows], seen: visible };
                     lists.refill(threads, visible, grid, band);
                 }
-                let mut fresh = band.start == 0;
-                for part in parts(threads, lists, band.len(), records.len() / STRIDE) {
-                    threads.each_with("replay", part.tiles.clone(), Batch::new, |batch, i| {
-                        let tile = band.start + i;
-                        arch.dispatch(Weights {
-                            splats,
-                            list: lists.of_tile(i),
-                            place: TilePlace::new(grid, tile),
-                            blending,
-                            surface: &gradient[tile].planes[BY_DEPTH],
-                            records: part.records(lists, i, records, STRIDE),
-                            batch,
-                        });
-                    });
-                    let to = Sums { sums, stride: STRIDE, fresh, visible };
-                    let add = |sums: &mut [f32], records: &[AtomicU32]| {
-                        gather_all::<STRIDE>(sums, false, records);
-                    };
-                    part.gather(threads, lists, records, to, add);
-                    fresh = false;
-                }
+                let tiles = canvas[band.clone()].par_iter_mut().enumerate();
+                threads.each_with("replay", tiles, Batch::new, |batch, (i, canvas)| {
+                    let place = TilePlace::new(grid, band.start + i);
+                    let list = lists.of_tile(i);
+                    arch.dispatch(Depths { splats, list, place, blending, canvas, batch });
+                });
             }
         });
-        for gradient in &mut gradient[..grid.tiles()] {
-            gradient.planes[BY_DEPTH] = ZERO_PLANE;
-        }
-        let is_seen = |row: usize| visible[row / WIDTH] >> (row % WIDTH) & 1 == 1;
-        let weights = |row: usize| match is_seen(row) {
-            true => RowWeights { in_front: sums[row * STRIDE], whole: sums[row * STRIDE + 1] },
-            false => RowWeights::default(),
-        };
-        Ok((0..rows).map(weights).collect())
     }
 }
 
@@ -200,59 +136,6 @@ impl WithSimd for Depths<'_> {
                     if is_finished(&transmittance[p]) {
                         unfinished &= !(1 << p);
                     }
-                }
-            }
-        }
-    }
-}
-
-/// Replays the blending of one tile for the weights of its entries.
-struct Weights<'a> {
-    splats: &'a [Splat],
-    /// The tile's entries, sorted front to back.
-    list: &'a [AtomicU64],
-    place: TilePlace,
-    /// The settings of the forward pass.
-    blending: Blending,
-    surface: &'a Plane,
-    /// The records of this tile's entries; only entries in the current [`Part`](super::records::Part) have one.
-    records: TileRecords<'a>,
-    /// Scratch.
-    batch: &'a mut Batch,
-}
-
-impl WithSimd for Weights<'_> {
-    type Output = ();
-
-    #[inline(always)]
-    fn with_simd<S: Simd>(self, s: S) {
-        let Self { splats, list, place, blending, surface, records, batch } = self;
-        let c = |x: f32| V::splat(s, x);
-        let zero = V::zero(s);
-        let (mut transmittance, mut unfinished) = place.inside();
-        for (n, chunk) in list.chunks(BATCH).enumerate() {
-            batch.set(s, splats, chunk, &place);
-            for (i, entry) in chunk.iter().enumerate() {
-                let splat = &batch.splats[i];
-                let mut todo = batch.patches_of[i] & unfinished;
-                let mut sums = [zero; STRIDE];
-                while todo != 0 {
-                    let p = todo.trailing_zeros() as usize % PATCHES;
-                    todo &= todo - 1;
-                    for at in (0..WIDTH).step_by(S::F32_LANES) {
-                        let Blended { weight, .. } =
-                            blend(s, batch, blending, [i, p, at], &mut transmittance[p]);
-                        let in_front = c(splat.depth).lt(V::load(s, &surface[p][at..]));
-                        sums[0] = sums[0] + in_front.keep(weight);
-                        sums[1] = sums[1] + weight;
-                    }
-                    if is_finished(&transmittance[p]) {
-                        unfinished &= !(1 << p);
-                    }
-                }
-                let record = records.record(Entry::load(entry), n * BATCH + i);
-                for (to, sum) in record.into_iter().flatten().zip(sums) {
-                    to.store(sum.sum().to_bits(), Relaxed);
                 }
             }
         }

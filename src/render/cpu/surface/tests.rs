@@ -4,10 +4,8 @@ use glam::{DMat3, DVec3};
 
 use super::*;
 use crate::cpu::InstructionSet;
-use crate::{AuxInput, Backend, Inspect, Setup};
+use crate::{Backend, Inspect, Setup};
 use densify_core::gaussians::{Gaussians, logit};
-use densify_core::image::Image8;
-use densify_policies::policy::{AuxColumn, AuxRequest};
 
 const OPACITIES: [f32; 3] = [0.4, 0.5, 0.9];
 const DEPTHS: [f32; 3] = [2.0, 3.0, 4.0];
@@ -78,51 +76,5 @@ fn depths_of_three_layers_are_exact() {
         faint.opacity_logits[..2].fill(logit(1e-4));
         backend = CpuBackend::new(&faint, &Setup::new(43)).expect("a backend");
         assert!(backend.render_depths(&camera()).expect("depths").median.iter().all(|&z| z == 0.0));
-    }
-}
-
-#[test]
-fn weights_are_divided_at_the_surface() {
-    let model = model();
-    let target =
-        Image8 { width: 37, height: 29, rgb: vec![0; 3 * 37 * 29], alpha: None, mask: None };
-    let request = AuxRequest { columns: vec![AuxColumn::WeightSum], ..AuxRequest::default() };
-    let mut first = None;
-    for mut backend in backends(&model) {
-        let observed = backend
-            .observe(&AuxInput {
-                step: 1,
-                view: 0,
-                seed: 0,
-                camera: &camera(),
-                target: &target,
-                background: [0.0; 3],
-                exposure: None,
-                sh_degree: 0,
-                request: &request,
-            })
-            .expect("weights");
-        let mut weights = |depth: f32| {
-            let surface = vec![depth; 37 * 29];
-            backend.weights_in_front(&camera(), &surface).expect("weights")
-        };
-        let (none, some, all) = (weights(0.0), weights(3.5), weights(9.0));
-        for (row, &whole) in observed.columns[0].1.iter().enumerate() {
-            assert!(whole > 0.0);
-            assert_eq!((none[row].whole, some[row].whole, all[row].whole), (whole, whole, whole));
-            assert_eq!((none[row].in_front, all[row].in_front), (0.0, whole), "row {row}");
-            assert_eq!(some[row].in_front, if row == 0 { 0.0 } else { whole }, "row {row}");
-        }
-        // Half of the image has its surface in front of the first layer.
-        let left: Vec<f32> = (0..37 * 29).map(|at| if at % 37 < 18 { 0.0 } else { 2.5 }).collect();
-        let divided = backend.weights_in_front(&camera(), &left).expect("weights");
-        let share = divided[2].in_front / divided[2].whole;
-        assert!((share - 19.0 / 37.0).abs() < 0.02, "{share}");
-        // Bands, parts and vectors of any width: the same up to rounding.
-        let close = |a: f32, b: f32| (a - b).abs() <= 1e-5 * a.abs().max(1e-3);
-        let first = first.get_or_insert_with(|| divided.clone());
-        for (a, b) in first.iter().zip(&divided) {
-            assert!(close(a.in_front, b.in_front) && close(a.whole, b.whole), "{a:?}, {b:?}");
-        }
     }
 }

@@ -141,6 +141,7 @@ fn train(trial: &mut Trial<'_>, name: &str) -> Result<(), Box<dyn std::error::Er
         on_nan: OnNan::Stop,
         depth: None,
         distortion: 0.0,
+        removes_floaters: false,
     };
     let policy = find(name)?.build(&toml::Table::new(), &scene)?;
     let needs = policy.needs(&scene);

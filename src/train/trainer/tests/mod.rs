@@ -25,6 +25,7 @@ use densify_render::{
 };
 
 mod edits;
+mod floaters;
 mod nonfinite;
 mod policy_views;
 mod steps;
@@ -93,7 +94,15 @@ impl Backend for CountingBackend {
         let (x, degree) = (input.camera.translation.x, input.sh_degree);
         note(&self.log, format!("observe {x}, pixel {}, degree {degree}", input.target.rgb[0]));
         assert_eq!((input.view as f64, input.seed), (x, 7));
-        let columns = input.request.columns.iter().map(|&c| (c, vec![x as f32; self.rows]));
+        let columns = input.request.columns.iter().map(|&column| {
+            let mut values = vec![x as f32; self.rows];
+            if column == AuxColumn::WeightInFront {
+                // Most of the weight of the second row, and half of that of the others.
+                let share = |row: usize| if row == 1 { 0.6 } else { 0.5 };
+                values.iter_mut().enumerate().for_each(|(row, value)| *value *= share(row));
+            }
+            (column, values)
+        });
         Ok(AuxOutput { loss: 0.5, columns: columns.collect(), points: Vec::new() })
     }
     fn take_signals(&mut self, wanted: SignalSet) -> Result<Signals, BackendError> {
@@ -331,6 +340,7 @@ const OPTIONS: TrainOptions = TrainOptions {
     on_nan: OnNan::Prune,
     depth: None,
     distortion: 0.0,
+    removes_floaters: false,
 };
 
 fn build(

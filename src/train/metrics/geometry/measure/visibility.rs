@@ -169,17 +169,17 @@ fn observed(
     request: &AuxRequest,
 ) -> Result<Vec<(AuxColumn, Vec<f32>)>, BackendError> {
     let Camera { width, height, .. } = *camera;
-    let rgb = vec![0; 3 * width as usize * height as usize];
     let output = backend.observe(&AuxInput {
         step: 1,
         view: 0,
         seed: 0,
         camera,
         // Weights do not depend on the target.
-        target: &Image8 { width, height, rgb, alpha: None, mask: None },
+        target: &Image8::black(width, height),
         background: scene.background,
         exposure: None,
         sh_degree: scene.sh_degree,
+        depth: None,
         request,
     })?;
     Ok(output.columns)
