@@ -240,8 +240,8 @@ run_spec! {
         /// (default: 0)
         distortion_weight: Option<Weight> = None, Fixed, value "WEIGHT";
 
-        /// Prune Gaussians with most of their weight in front of the surface, after the first three tenths of the run; the
-        /// policy grows others. The surface is the given depth, or else the model's own median depth
+        /// Prune Gaussians with most of their weight in front of the given depth, or else of the model's own median depth,
+        /// after each of the first three tenths of the run
         remove_floaters: bool = false, Fixed, switch Set;
     }
 
