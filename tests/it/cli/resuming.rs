@@ -8,8 +8,8 @@ use serde_json::Value;
 use tempfile::TempDir;
 
 use super::{
-    Outcome, copy_unfinished, count, files, frequent_edits, json, model, read, records, resume,
-    scratch, train,
+    Outcome, config, copy_unfinished, count, files, frequent_edits, json, model, read, records,
+    resume, scratch, train,
 };
 use crate::photographs::Photographs;
 use crate::subject::devices;
