@@ -102,6 +102,7 @@ fn say_what_is_assumed(saved: &RunConfig, now: &RunSpec, observer: &dyn Observer
         let set = now.density.policy_set.iter().find(|set| set.path == assumed.path);
         if let Some(Assignment { path, value }) = set {
             let path = path.join(".");
+            let value = value.as_str().map_or_else(|| value.to_string(), str::to_owned);
             observer.say(format_args!(
                 "note: the run was saved before {path} existed; it goes on with {path}={value}"
             ));
