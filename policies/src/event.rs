@@ -3,8 +3,8 @@
 use crate::conformance::check_policy_with;
 use crate::plan::{EditPlan, Offspring, ParentFate, RowOps};
 use crate::policy::{
-    AuxColumn, AuxView, Candidate, DensityPolicy, PolicyResult, SceneInfo, Signal, SignalSet,
-    Signals, Snapshot,
+    AuxColumn, AuxView, Candidate, DensityPolicy, PixelLoss, PolicyResult, SceneInfo, Signal,
+    SignalSet, Signals, Snapshot,
 };
 use crate::registry::find;
 use crate::rng::PolicyRng;
@@ -27,6 +27,26 @@ pub(crate) fn assert_conforms(name: &str, sets: &[&str]) {
             panic!("{set}: {report}");
         }
     }
+}
+
+/// Asserts that `pixel_loss` sets the pixel term, that the default decides by the number of training views, and that the
+/// file of a run names the decision.
+pub(crate) fn assert_pixel_loss(name: &str) {
+    let policy = find(name).unwrap();
+    for (views, by_views) in [(39, "l1"), (40, "huber")] {
+        let scene = SceneInfo { train_views: views, ..Event::new(1, 1, 1).scene };
+        for (set, expected) in
+            [("", by_views), ("auto", by_views), ("l1", "l1"), ("huber", "huber")]
+        {
+            let set = if set.is_empty() { String::new() } else { format!("pixel_loss = '{set}'") };
+            let saved = policy.effective(&set.parse().unwrap(), &scene).unwrap();
+            assert_eq!(saved["pixel_loss"].as_str(), Some(expected), "{views} views, {set:?}");
+            let used = build(name, &set, &scene).needs(&scene).pixel_loss;
+            let expected = if expected == "l1" { PixelLoss::L1 } else { PixelLoss::Huber };
+            assert_eq!(used, expected, "{views} views, {set:?}");
+        }
+    }
+    assert_eq!(policy.added_parameters(), [("pixel_loss", "l1")]);
 }
 
 /// Asserts that the policy has the parameters of `vanilla`, and that at a growth step with the four rows of `event` it

@@ -75,7 +75,9 @@ def fixed_text(name: str, content: str, folders: list[tuple[str, str]], dropped:
     for pattern, part in VARYING:
         if fnmatch(name, pattern):
             content = re.sub(part, "", content, flags=re.MULTILINE)
-    return "\n".join(line for line in content.splitlines() if not any(re.search(it, line) for it in dropped))
+    kept = "\n".join(line for line in content.splitlines() if not any(re.search(it, line) for it in dropped))
+    # The last key of an object, if it was left out, leaves a comma.
+    return re.sub(r",(?=\s*[}\]])", "", kept) if dropped and name.endswith(".json") else kept
 
 
 def lines_difference(left: str, right: str):

@@ -130,10 +130,20 @@ class Program:
         done = subprocess.run([self.path, *words.split()], capture_output=True, text=True, env=self.environment)
         return done.stdout
 
+    def as_reference(self, case: Case, reference: "Program") -> list[str]:
+        """The commands of a case, with the parameter that makes this program do what the reference does without it."""
+        if not case.as_before:
+            return list(case.commands)
+        policy, parameter = case.as_before.split("=")[0].split(".")
+        known = [f"| {parameter} |" in it.printed(f"policies {policy}") for it in (self, reference)]
+        more = f" --policy-set {case.as_before}" if known == [True, False] else ""
+        return [command + more * command.startswith("train ") for command in case.commands]
+
     def run(self, case: Case, reference: "Program") -> Path:
         """Runs a case unless it has been run already. Returns the folder of its output."""
         folder = self.outputs / case.name
-        described = {"commands": list(case.commands), "start": case.start, "without": list(case.without)}
+        commands = case.commands if self is reference else self.as_reference(case, reference)
+        described = {"commands": list(commands), "start": case.start, "without": list(case.without)}
         try:
             recorded = json.loads((folder / "case.json").read_text())
             if all(recorded[key] == value for key, value in described.items()):
@@ -149,7 +159,7 @@ class Program:
                 shutil.rmtree(path) if path.is_dir() else path.unlink()
         folder.mkdir(parents=True, exist_ok=True)
         started, codes = time.monotonic(), []
-        for number, command in enumerate(case.commands, 1):
+        for number, command in enumerate(commands, 1):
             words = [word.replace("{data}", str(self.data)) for word in shlex.split(command)]
             name = folder / f"{number}-{words[0]}"
             with open(f"{name}.out", "wb") as out, open(f"{name}.err", "wb") as err:

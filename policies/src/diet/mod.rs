@@ -43,8 +43,9 @@
 //! Each event is one plan in which Gaussians are pruned before new ones take their places, so the budget holds
 //! at all times. The published code exceeds it between insertion and the next pruning; this is not
 //! reproduced. Opacities are never reset. The published settings also use a learning rate of 0.025 for
-//! opacities (`--lr opacity=0.025`), and L1 as the pixel term of the loss, where this policy uses Huber's
-//! function from 40 training views on (docs/studies/short-runs.tsv).
+//! opacities (`--lr opacity=0.025`), and L1 as the pixel term of the loss (`pixel_loss = "l1"`), where this policy uses
+//! Huber's function from 40 training views on, with larger learning rates in runs of fewer than 30,000 iterations
+//! (docs/studies/short-runs.tsv).
 //!
 //! ## Choices
 //!
@@ -135,6 +136,7 @@
 //! | newborn_opacity | 0.1 | 0 to 1, both excluded | | opacity of inserted Gaussians |
 //! | reinit_at | 0 | >= 0 | step | step at which the whole model is replaced; 0: never |
 //! | reinit_share | 0.8 | 0 to 1, 0 excluded | budget | maximum number of Gaussians after the replacement |
+//! | pixel_loss | "auto" | auto, l1, huber | | pixel term of the loss; `auto`: `huber` from 40 training views on |
 //!
 //! ## Ablations
 //!
@@ -155,7 +157,7 @@ use crate::adc::{
 use crate::parameters::StepParameter::{self, Interval, Step};
 use crate::plan::{EditPlan, Reset};
 use crate::policy::{
-    AuxColumn, AuxRequest, AuxView, Candidate, DensityPolicy, Needs, PixelLoss, PolicyResult,
+    AuxColumn, AuxRequest, AuxView, Candidate, DensityPolicy, Needs, PixelLossChoice, PolicyResult,
     SceneInfo, Signal, SignalSet, Snapshot,
 };
 use crate::quota::event_quota;
@@ -210,6 +212,13 @@ impl ConfiguredPolicy for Diet {
         Step("reinit_at"),
     ];
 
+    const ADDED_PARAMETERS: &'static [(&'static str, &'static str)] = &[PixelLossChoice::BEFORE];
+
+    fn decided(mut params: DietParams, scene: &SceneInfo) -> DietParams {
+        params.pixel_loss = params.pixel_loss.decided(scene.train_views);
+        params
+    }
+
     fn new(params: DietParams, scene: &SceneInfo) -> PolicyResult<Self> {
         params.check()?;
         let compensates = params.rho_c > 0.0;
@@ -253,7 +262,7 @@ impl DensityPolicy for Diet {
             candidates: self.candidate_request(scene),
             full_depth: self.scene_units(self.params.full_depth, scene),
             aux: self.aux_request(scene),
-            pixel_loss: PixelLoss::for_views(scene.train_views),
+            pixel_loss: self.params.pixel_loss.term(scene.train_views),
             ..Needs::default()
         }
     }

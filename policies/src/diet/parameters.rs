@@ -5,7 +5,7 @@ use std::ops::Bound::{Excluded, Included, Unbounded};
 use serde::{Deserialize, Serialize};
 
 use crate::parameters::in_range;
-use crate::policy::{DepthMode, ErrorMode, PolicyResult};
+use crate::policy::{DepthMode, ErrorMode, PixelLossChoice, PolicyResult};
 
 /// Parameters of [`Diet`](super::Diet).
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -50,6 +50,7 @@ pub struct DietParams {
     pub newborn_opacity: f64,
     pub reinit_at: u32,
     pub reinit_share: f64,
+    pub pixel_loss: PixelLossChoice,
 }
 
 /// The limit on the number of candidates that grow.
@@ -162,6 +163,7 @@ impl Default for DietParams {
             newborn_opacity: 0.1,
             reinit_at: 0,
             reinit_share: 0.8,
+            pixel_loss: PixelLossChoice::Auto,
         }
     }
 }

@@ -400,6 +400,11 @@ fn needs_list_only_used_signals() {
     assert_eq!(needs("compensate_until = 10000").candidates, None);
 }
 
+#[test]
+fn the_pixel_loss_depends_on_the_views_unless_it_is_set() {
+    crate::event::assert_pixel_loss("diet");
+}
+
 /// A view that shows surface points on a line, one unit apart, starting at `from`.
 fn surface(from: f32, count: u32) -> View {
     let point =

@@ -39,7 +39,8 @@
 //!
 //! Each event is one plan that prunes before it grows, so the budget holds at all times. Opacities are
 //! never reset, the pixel term of the loss is Huber's function (L1 below 40 training views), the loss has no
-//! additional terms, and learning rates are the trainer's.
+//! additional terms, and learning rates are the trainer's. With Huber's function, these are larger in runs of fewer
+//! than 30,000 iterations (docs/studies/short-runs.tsv).
 //!
 //! ## Parameters
 //!
@@ -61,13 +62,15 @@
 //! | split_share | 0.45 | 0 to 1, both excluded | | d of the split |
 //! | child_opacity | 0.6 | 0 to 1, 0 excluded | | factor on the opacity in a split |
 //! | min_opacity | 0.005 | 0 to 1 | | Gaussians below this opacity are pruned |
+//! | pixel_loss | "auto" | auto, l1, huber | | pixel term of the loss; `auto`: `huber` from 40 training views on |
 //!
 //! ## Ablations
 //!
 //! Slow filling is switched off by `curve_until = 0`, turnover by `rho = 0` and `replaceable = 0`, its
 //! adaptation to the scene by `replaceable = 0` alone, absolute gradients by `gradient = "screen"`, the colour
 //! gradient by `colour_weight = 0`, the weighting of near views by `full_depth = 0`, the minimum number of
-//! views by `least_views = 0`, clones by `small = 0`, protection by `protect = 0`.
+//! views by `least_views = 0`, clones by `small = 0`, protection by `protect = 0`, Huber's function and the larger steps of
+//! short runs by `pixel_loss = "l1"`.
 //!
 //! Defaults in steps are for a run of 30,000 iterations and scale with its length; intervals
 //! (`…_every`) do not shrink below 100 steps. `protect` does not scale.
@@ -78,7 +81,7 @@ use crate::adc::{
 use crate::parameters::StepParameter::{self, Interval, Step};
 use crate::plan::{EditPlan, Offspring, Reset};
 use crate::policy::{
-    DensityPolicy, Needs, PixelLoss, PolicyResult, SceneInfo, Signal, SignalSet, Snapshot,
+    DensityPolicy, Needs, PixelLossChoice, PolicyResult, SceneInfo, Signal, SignalSet, Snapshot,
 };
 use crate::registry::ConfiguredPolicy;
 use crate::rng::PolicyRng;
@@ -112,6 +115,13 @@ impl ConfiguredPolicy for Merit {
     const STEP_PARAMETERS: &'static [StepParameter] =
         &[Step("grow_from"), Step("grow_until"), Interval("grow_every"), Step("curve_until")];
 
+    const ADDED_PARAMETERS: &'static [(&'static str, &'static str)] = &[PixelLossChoice::BEFORE];
+
+    fn decided(mut params: MeritParams, scene: &SceneInfo) -> MeritParams {
+        params.pixel_loss = params.pixel_loss.decided(scene.train_views);
+        params
+    }
+
     fn new(params: MeritParams, scene: &SceneInfo) -> PolicyResult<Self> {
         params.check()?;
         let MeritParams { grow_from: from, grow_until: until, grow_every: every, .. } = params;
@@ -141,7 +151,7 @@ impl DensityPolicy for Merit {
         Needs {
             signals,
             full_depth,
-            pixel_loss: PixelLoss::for_views(scene.train_views),
+            pixel_loss: self.params.pixel_loss.term(scene.train_views),
             ..Needs::default()
         }
     }

@@ -5,7 +5,7 @@ use std::ops::Bound::{Excluded, Included};
 use serde::{Deserialize, Serialize};
 
 use crate::parameters::in_range;
-use crate::policy::{PolicyResult, Signal};
+use crate::policy::{PixelLossChoice, PolicyResult, Signal};
 
 /// Parameters of [`Merit`](super::Merit).
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -28,6 +28,7 @@ pub struct MeritParams {
     pub split_share: f64,
     pub child_opacity: f64,
     pub min_opacity: f64,
+    pub pixel_loss: PixelLossChoice,
 }
 
 /// The gradient with respect to the projected mean.
@@ -68,6 +69,7 @@ impl Default for MeritParams {
             split_share: 0.45,
             child_opacity: 0.6,
             min_opacity: 0.005,
+            pixel_loss: PixelLossChoice::Auto,
         }
     }
 }

@@ -144,6 +144,11 @@ fn needs_list_only_used_signals() {
 }
 
 #[test]
+fn the_pixel_loss_depends_on_the_views_unless_it_is_set() {
+    crate::event::assert_pixel_loss("merit");
+}
+
+#[test]
 fn other_parameter_values_conform() {
     assert_conforms(
         "merit",

@@ -14,7 +14,7 @@ pub use pixels::{
     AuxRequest, CandidateRequest, DepthMode, ErrorMap, ErrorMode, ErrorScore, PixelMap,
 };
 pub use rates::{Cadence, Fade, Rate, RateOverrides};
-pub use terms::{LossTerms, MaskTerm, NoiseTerm, PixelLoss};
+pub use terms::{LossTerms, MaskTerm, NoiseTerm, PixelLoss, PixelLossChoice};
 
 /// The inputs of a policy, and its changes to initialisation and training.
 #[derive(Debug, Clone, PartialEq, Default)]

@@ -37,6 +37,42 @@ impl PixelLoss {
     }
 }
 
+/// A policy's parameter `pixel_loss`: the pixel term of the image loss.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum PixelLossChoice {
+    /// [`PixelLoss::for_views`].
+    #[default]
+    Auto,
+    /// [`PixelLoss::L1`].
+    L1,
+    /// [`PixelLoss::Huber`].
+    Huber,
+}
+
+impl PixelLossChoice {
+    /// What runs used that were saved before the parameter existed.
+    pub const BEFORE: (&'static str, &'static str) = ("pixel_loss", "l1");
+
+    /// The pixel term in a scene with this many training views.
+    pub fn term(self, train_views: u32) -> PixelLoss {
+        match self {
+            Self::Auto => PixelLoss::for_views(train_views),
+            Self::L1 => PixelLoss::L1,
+            Self::Huber => PixelLoss::Huber,
+        }
+    }
+
+    /// The choice that gives the same term whatever the number of training views.
+    #[must_use]
+    pub fn decided(self, train_views: u32) -> Self {
+        match self.term(train_views) {
+            PixelLoss::L1 => Self::L1,
+            PixelLoss::Huber => Self::Huber,
+        }
+    }
+}
+
 /// Coefficients of terms added to the image loss; 0 switches a term off, at no cost.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct LossTerms {

@@ -95,4 +95,14 @@ fn scenes_with_few_views_are_trained_with_l1() {
     let [few, enough] = [39, 40].map(PixelLoss::for_views);
     assert_eq!((few, enough), (PixelLoss::L1, PixelLoss::Huber));
     assert!(few.bound() == 0.0 && enough.bound() > 0.0);
+    for views in [39, 40] {
+        assert_eq!(PixelLossChoice::Auto.term(views), PixelLoss::for_views(views));
+        assert_eq!(PixelLossChoice::L1.term(views), PixelLoss::L1);
+        assert_eq!(PixelLossChoice::Huber.term(views), PixelLoss::Huber);
+        for choice in [PixelLossChoice::Auto, PixelLossChoice::L1, PixelLossChoice::Huber] {
+            let decided = choice.decided(views);
+            assert!(decided != PixelLossChoice::Auto);
+            assert_eq!(decided.term(100 - views), choice.term(views));
+        }
+    }
 }

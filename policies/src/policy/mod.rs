@@ -11,7 +11,8 @@ use serde::{Deserialize, Serialize};
 pub use crate::error::{PolicyError, PolicyResult};
 pub use crate::needs::{
     AuxRequest, Cadence, CandidateRequest, DepthMode, ErrorMap, ErrorMode, ErrorScore, Fade,
-    LossTerms, MaskTerm, Needs, NoiseTerm, PixelLoss, PixelMap, Rate, RateOverrides, StartRule,
+    LossTerms, MaskTerm, Needs, NoiseTerm, PixelLoss, PixelLossChoice, PixelMap, Rate,
+    RateOverrides, StartRule,
 };
 use crate::plan::EditPlan;
 use crate::rng::PolicyRng;

@@ -26,7 +26,15 @@ pub trait PolicyFactory: Send + Sync {
     /// The reason why a value does not fit.
     fn typed(&self, table: Table) -> Result<Table, String>;
 
-    /// Builds a policy from a value for every parameter, which [`typed`](Self::typed) has returned.
+    /// Converts parameters to their types, with [decisions](super::ConfiguredPolicy::decided) for this scene.
+    ///
+    /// # Errors
+    /// As [`typed`](Self::typed).
+    fn decided(&self, table: Table, _scene: &SceneInfo) -> Result<Table, String> {
+        self.typed(table)
+    }
+
+    /// Builds a policy from a value for every parameter, which [`decided`](Self::decided) has returned.
     ///
     /// # Errors
     /// [`PolicyError::BadParameter`] when a value is out of range; any other error of the policy.
@@ -48,7 +56,8 @@ impl PolicyEntry {
         step_parameters: &'static [StepParameter],
         factory: &'static dyn PolicyFactory,
     ) -> Self {
-        Self { name, summary, source, doc, place, step_parameters, factory }
+        let added_parameters = &[];
+        Self { name, summary, source, doc, place, step_parameters, added_parameters, factory }
     }
 }
 

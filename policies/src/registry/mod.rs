@@ -34,6 +34,16 @@ pub trait ConfiguredPolicy: DensityPolicy + Sized + 'static {
     /// shrink below 100 steps (or below its default, if that is less).
     const STEP_PARAMETERS: &'static [StepParameter] = &[];
 
+    /// Parameters that were added after runs had been saved without them, each with the value that stands for what these
+    /// runs did. A saved run that lacks the parameter is resumed and repeated with this value, not with the default.
+    const ADDED_PARAMETERS: &'static [(&'static str, &'static str)] = &[];
+
+    /// Replaces choices that are left to the scene by what is chosen in `scene`, so that the file of a run names it.
+    #[must_use]
+    fn decided(params: Self::Params, _scene: &SceneInfo) -> Self::Params {
+        params
+    }
+
     /// Builds the policy. Check ranges here, with [`in_range`](crate::parameters::in_range).
     ///
     /// # Errors
@@ -75,6 +85,7 @@ pub struct PolicyEntry {
     doc: &'static str,
     place: (&'static str, u32),
     step_parameters: &'static [StepParameter],
+    added_parameters: &'static [(&'static str, &'static str)],
     factory: &'static dyn PolicyFactory,
 }
 
@@ -102,6 +113,11 @@ impl<P: ConfiguredPolicy> PolicyFactory for Configured<P> {
         Table::try_from(params).map_err(first_line)
     }
 
+    fn decided(&self, table: Table, scene: &SceneInfo) -> Result<Table, String> {
+        let params: P::Params = table.try_into().map_err(first_line)?;
+        Table::try_from(P::decided(params, scene)).map_err(first_line)
+    }
+
     fn build(&self, table: Table, scene: &SceneInfo) -> PolicyResult<Box<dyn DensityPolicy>> {
         let params = table.try_into().map_err(|e| PolicyError::Other(first_line(e)))?;
         Ok(Box::new(P::new(params, scene)?))
@@ -117,9 +133,9 @@ impl PolicyEntry {
         doc: &'static str,
         place: (&'static str, u32),
     ) -> Self {
-        let step_parameters = P::STEP_PARAMETERS;
+        let (step_parameters, added_parameters) = (P::STEP_PARAMETERS, P::ADDED_PARAMETERS);
         let factory = const { &Configured::<P>(PhantomData) };
-        Self { name, summary, source, doc, place, step_parameters, factory }
+        Self { name, summary, source, doc, place, step_parameters, added_parameters, factory }
     }
 
     /// The place where the policy is registered (file:line).
@@ -149,6 +165,11 @@ impl PolicyEntry {
         self.step_parameters
     }
 
+    /// See [`ConfiguredPolicy::ADDED_PARAMETERS`].
+    pub fn added_parameters(&self) -> &'static [(&'static str, &'static str)] {
+        self.added_parameters
+    }
+
     /// Names of all parameters, in declaration order.
     pub fn parameter_names(&self) -> Vec<String> {
         let mut names = self.factory.parameter_names();
@@ -172,8 +193,8 @@ impl PolicyEntry {
         listed
     }
 
-    /// The parameters of a run: the defaults, scaled to its length, overridden by `set`. Ranges are
-    /// checked by [`build`](Self::build).
+    /// The parameters of a run: the defaults, scaled to its length, overridden by `set`, with
+    /// [decisions](ConfiguredPolicy::decided) for this scene. Ranges are checked by [`build`](Self::build).
     ///
     /// # Errors
     /// [`PolicyError::UnknownParameter`]; [`PolicyError::BadParameter`] for a wrong type.
@@ -192,7 +213,7 @@ impl PolicyEntry {
                 reason: format!("{value} does not fit: {reason}"),
             })?;
         }
-        self.factory.typed(table).map_err(|reason| self.bad_defaults(&reason))
+        self.factory.decided(table, scene).map_err(|reason| self.bad_defaults(&reason))
     }
 
     /// Builds the policy with the parameters in `set` and [effective](Self::effective) defaults.

@@ -17,7 +17,7 @@ use zip::result::ZipError;
 use super::LoadError;
 use super::paths::{lexical_fault, relative};
 use super::{Dataset, LoadOptions, Note, View};
-use crate::models::folder_in_archive;
+use crate::models::{folder_in_archive, is_streamed};
 use densify_core::files;
 use densify_core::memory::Bytes;
 
@@ -39,11 +39,11 @@ pub(super) struct Unpacked {
     bytes: u64,
 }
 
-/// Returns true if a file, whatever its name, is a complete ZIP archive other than a SOG model.
+/// Returns true if a file, whatever its name, is a complete ZIP archive other than a SOG model, streamed or not.
 pub fn is_archive(path: &Path) -> bool {
     let is_model = |archive: &ZipArchive<BufReader<File>>| {
         let names: Vec<_> = archive.file_names().flatten().collect();
-        folder_in_archive(&names).is_some()
+        folder_in_archive(&names).is_some() || is_streamed(&names)
     };
     is_zip(path) && open(path).is_ok_and(|archive| !is_model(&archive))
 }

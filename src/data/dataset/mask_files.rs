@@ -28,12 +28,14 @@ pub(super) struct MaskFile {
     pub(super) path: PathBuf,
     /// True if all values but 0 hide a pixel completely; otherwise 0 hides it completely and grey in part.
     pub(super) hides_all_but_black: bool,
+    /// The path of another machine that led to the file, if a suffix of it did.
+    pub(super) listed: Option<String>,
 }
 
 impl MaskFile {
     /// A mask whose black pixels hide those of the photograph.
     pub(super) fn black_hides(path: PathBuf) -> Self {
-        Self { path, hides_all_but_black: false }
+        Self { path, hides_all_but_black: false, listed: None }
     }
 }
 
@@ -163,7 +165,7 @@ impl Folders {
             ] {
                 if let Some(path) = at(root, with_file_name(&place, &value))? {
                     let hides_all_but_black = value.starts_with(DYNAMIC);
-                    return Ok(Some(MaskFile { path, hides_all_but_black }));
+                    return Ok(Some(MaskFile { path, hides_all_but_black, listed: None }));
                 }
             }
         }

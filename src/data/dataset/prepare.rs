@@ -224,6 +224,17 @@ fn refuse_duplicates(listing: &Path, frames: &[Frame]) -> Result<(), LoadError> 
             return Err(LoadError::Remedied { problem, remedy: LoadRemedy::ImagesFolderOfBoth });
         }
     }
+    let mut by_mask = HashMap::new();
+    for frame in frames {
+        let Some(mask) = &frame.mask else { continue };
+        let Some(listed) = &mask.listed else { continue };
+        let first: &String = by_mask.entry(&mask.path).or_insert(listed);
+        if first != listed {
+            let problem = format!("the masks {first:?} and {listed:?} are {}", mask.path.display());
+            let remedy = "copy the folders of both into the dataset's folder, or correct the paths";
+            return Err(LoadError::malformed(listing, "mask_path", problem, remedy));
+        }
+    }
     for pair in frames.windows(2) {
         if pair[0].name == pair[1].name && pair[0].held_out == pair[1].held_out {
             let (problem, remedy) = ("the image is listed twice", "remove one of the two");

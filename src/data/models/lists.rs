@@ -10,6 +10,21 @@ use densify_core::files::one_line;
 /// Name of the list in a folder of streamed SOG.
 pub(super) const STREAMED: &str = "lod-meta.json";
 
+/// Returns true if an archive with these files holds a streamed SOG.
+pub(crate) fn is_streamed<N: AsRef<str>>(names: &[N]) -> bool {
+    let file = |name: &str| name.rsplit('/').next() == Some(STREAMED);
+    names.iter().map(AsRef::as_ref).any(|name| file(name) && !name.starts_with("__MACOSX/"))
+}
+
+/// The error for an archive of which [`is_streamed`] is true.
+pub(super) fn refusal_of_archive(path: &Path) -> LoadError {
+    LoadError::Data(format!(
+        "{} is a streamed SOG in a ZIP archive: a list ({STREAMED}) of models in several levels of detail; unpack it, \
+         and name one of the meta.json files that the list names",
+        path.display()
+    ))
+}
+
 /// The error for a JSON file that lists models; `None` for other files.
 pub(super) fn refusal(path: &Path, text: &str) -> Option<LoadError> {
     // The whole text is parsed only if it may be a list.

@@ -37,6 +37,7 @@ pub use changes::Changes;
 pub use coordinates::{
     Coarseness, Coordinates, Frame, is_finer_than_f32, local_origin, offset_text, round_origin,
 };
+pub(crate) use lists::is_streamed;
 pub(crate) use ply::layout::OFFSET as PLY_OFFSET;
 pub use recognise::{Match, ModelFile, Reader, is_model_folder, main_file, read_model};
 pub use rows::SplatFile;

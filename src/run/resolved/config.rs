@@ -11,7 +11,7 @@ use super::{ResolvedRun, ResolvedTraining};
 use crate::failure::Failure;
 use crate::spec::{
     Assignment, Budget, ImageCache, InitChoice, NOT_OPTIONS, Partial, Rows, RunSpec, ShDegree,
-    assignments,
+    add_missing_parameters, assignments,
 };
 use densify_core::antialiasing::Antialiasing;
 use densify_core::files::{FileError, write_atomically};
@@ -33,6 +33,9 @@ pub struct RunConfig {
     pub budget: usize,
     /// The highest spherical-harmonic degree.
     pub sh_degree: u8,
+    /// Parameters of the policy that the file lacks, as they were added to the policy later. The description has them,
+    /// with values that stand for what the run did.
+    pub assumed: Vec<Assignment>,
 }
 
 /// Facts that preparing a run has found, and the reasons for its choices.
@@ -184,6 +187,7 @@ impl RunConfig {
             resolved,
             budget: size.rows,
             sh_degree: size.sh_degree,
+            assumed: Vec::new(),
         })
     }
 
@@ -209,10 +213,11 @@ impl RunConfig {
         let resolved = resolved.unwrap_or_else(|| Table::new().into());
         let resolved = Findings::deserialize(resolved)
             .map_err(|error| fail(&format!("resolved: {}", error.to_string().trim())))?;
+        let assumed = add_missing_parameters(&mut table);
         let spec = Partial::recorded(table, origin)?.spec()?;
         match (spec.size.budget.and_then(Budget::most), spec.size.sh_degree) {
             (Some(budget), Some(ShDegree::Fixed(sh_degree) | ShDegree::Auto(Some(sh_degree)))) => {
-                Ok(Self { densify, spec, resolved, budget, sh_degree })
+                Ok(Self { densify, spec, resolved, budget, sh_degree, assumed })
             }
             _ => Err(fail("`budget` and `sh_degree` must be numbers in the file of a run")),
         }
@@ -306,7 +311,8 @@ pub(crate) mod tests {
         spec.size.sh_degree = Some(ShDegree::Auto(Some(3)));
         spec.schedule.seed = i64::MAX as u64;
         spec.schedule.knob = vec!["alpha_min=1/128".parse::<Assignment>().unwrap()];
-        spec.density.policy_set = vec!["diet.rho=0.2".parse().unwrap()];
+        spec.density.policy_set =
+            ["diet.pixel_loss=l1", "diet.rho=0.2"].map(|set| set.parse().unwrap()).to_vec();
         let spread = Spread {
             tracks: 4_000,
             on_surface: 0.75,
@@ -317,7 +323,8 @@ pub(crate) mod tests {
         };
         let resolved =
             Findings { sh_degree_from: DegreeSource::Spread(spread), ..Findings::default() };
-        RunConfig { densify: "0.1.0".into(), spec, resolved, budget: 28_000, sh_degree: 3 }
+        let (densify, assumed) = ("0.1.0".into(), Vec::new());
+        RunConfig { densify, spec, resolved, budget: 28_000, sh_degree: 3, assumed }
     }
 
     #[test]
@@ -330,6 +337,23 @@ pub(crate) mod tests {
         // The file can also be passed to --config.
         let again = Partial::read(&root.path().join(CONFIG_FILE)).unwrap();
         assert_eq!(again.describe().unwrap(), sample().spec);
+    }
+
+    #[test]
+    fn a_run_of_before_a_parameter_keeps_what_it_did() {
+        let root = tempfile::tempdir().unwrap();
+        let (mut config, expected) = (sample(), sample());
+        let added = config.spec.density.policy_set.remove(0);
+        config.write(root.path()).unwrap();
+        let read = RunConfig::read(root.path()).unwrap();
+        assert_eq!((read.spec, read.assumed), (expected.spec.clone(), vec![added]));
+        let again = Partial::read(&root.path().join(CONFIG_FILE)).unwrap();
+        assert_eq!(again.describe().unwrap(), expected.spec);
+        // A file that is not a run's leaves defaults to the policy.
+        let by_hand = root.path().join("by-hand.toml");
+        std::fs::write(&by_hand, "policy = 'diet'\npolicy_set.diet.rho = 0.2").unwrap();
+        let by_hand = Partial::read(&by_hand).unwrap().describe().unwrap();
+        assert_eq!(by_hand.density.policy_set.len(), 1);
     }
 
     #[test]

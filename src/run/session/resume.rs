@@ -12,7 +12,7 @@ use super::records::SavedSession;
 use crate::failure::{Difference, Failure, ResumeProblem, notes};
 use crate::observer::Observer;
 use crate::resolved::RunConfig;
-use crate::spec::{OnResume, Partial, RunOption, RunSpec, assignments};
+use crate::spec::{Assignment, OnResume, Partial, RunOption, RunSpec, assignments};
 use densify_data::views::DatasetViews;
 use densify_train::checkpoint::{Checkpoint, CheckpointError, Fingerprint, newest};
 use densify_train::output::{CONFIG_FILE, RunFolder, saved_iterations};
@@ -90,9 +90,24 @@ pub fn start(
     }
     let mut spec = overlay(given, &resumed.config, &origin)?;
     spec.schedule.iterations.0 = length;
+    say_what_is_assumed(&resumed.config, &spec, observer);
     // The folder may have been moved since the run began.
     spec.output.output = Some(output);
     Ok((spec, Some(resumed)))
+}
+
+/// Tells the user the values of parameters that the saved run lacks, as they were added to its policy later.
+fn say_what_is_assumed(saved: &RunConfig, now: &RunSpec, observer: &dyn Observer) {
+    for assumed in &saved.assumed {
+        let set = now.density.policy_set.iter().find(|set| set.path == assumed.path);
+        if let Some(Assignment { path, value }) = set {
+            let path = path.join(".");
+            let value = value.as_str().map_or_else(|| value.to_string(), str::to_owned);
+            observer.say(format_args!(
+                "note: the run was saved before {path} existed; it goes on with {path}={value}"
+            ));
+        }
+    }
 }
 
 /// Overlays the saved options with those that are given.
@@ -187,12 +202,18 @@ pub(super) fn check(
 ) -> Result<(), Failure> {
     let origin = resumed.origin(output);
     let (current, original) = (fixed(now)?, fixed(&resumed.config)?);
+    // What the saved run lacks may be stated now.
+    let is_assumed = |key: &str| {
+        let mut assumed = resumed.config.assumed.iter();
+        let parameter = key.strip_prefix("policy_set.");
+        assumed.any(|assumed| parameter.is_some_and(|name| assumed.path.join(".") == name))
+    };
     let same_policy = now.spec.density.policy == resumed.config.spec.density.policy;
     let keys: BTreeSet<&String> = current.keys().chain(original.keys()).collect();
     let differences: Vec<Difference> = keys
         .into_iter()
         .filter(|key| same_policy || !key.starts_with("policy_set."))
-        .filter(|key| current.get(*key) != original.get(*key))
+        .filter(|key| current.get(*key) != original.get(*key) && !is_assumed(key))
         .map(|key| difference(key, current.get(key), original.get(key)))
         .collect();
     if !differences.is_empty() {

@@ -5,11 +5,13 @@
 //! [`RunSpec`]. The flags of `densify train` and their help, `config.toml`, `--config`, `--resume`, what
 //! `plan`, `compare` and `trade` pass on, and docs/options.md follow from this list.
 
+mod added;
 mod derived;
 pub mod knobs;
 mod overlay;
 mod values;
 
+pub(crate) use added::add_missing_parameters;
 pub(crate) use overlay::NOT_OPTIONS;
 pub use overlay::Partial;
 pub(crate) use values::assignments;

@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 use toml::{Table, Value};
 
 use super::knobs::{self, DEFAULT_PRESET};
-use super::{OPTIONS, RunOption, RunSpec};
+use super::{OPTIONS, RunOption, RunSpec, add_missing_parameters};
 use crate::failure::{Failure, OptionProblem};
 use densify_core::files;
 use densify_policies::parameters::{nearest, parse_value};
@@ -65,7 +65,8 @@ impl Partial {
         Ok(Self(table))
     }
 
-    /// Reads a TOML file with any of the options, such as the `config.toml` of a run, whose findings are ignored.
+    /// Reads a TOML file with any of the options, such as the `config.toml` of a run, whose findings are ignored. If the
+    /// policy of that run has got parameters since then, they keep to what the run did.
     ///
     /// # Errors
     /// As [`new`](Self::new), and when the file cannot be read.
@@ -75,6 +76,9 @@ impl Partial {
             let mut table: Table = text
                 .parse()
                 .map_err(|error: toml::de::Error| Failure::input(error.to_string().trim()))?;
+            if NOT_OPTIONS.iter().any(|&key| table.contains_key(key)) {
+                add_missing_parameters(&mut table);
+            }
             table.retain(|key, _| !NOT_OPTIONS.contains(&key));
             Self::checked(table, check_policies)
         };

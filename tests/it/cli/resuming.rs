@@ -8,8 +8,8 @@ use serde_json::Value;
 use tempfile::TempDir;
 
 use super::{
-    Outcome, copy_unfinished, count, files, frequent_edits, json, model, read, records, resume,
-    scratch, train,
+    Outcome, config, copy_unfinished, count, files, frequent_edits, json, model, read, records,
+    resume, scratch, train,
 };
 use crate::photographs::Photographs;
 use crate::subject::devices;
@@ -338,6 +338,62 @@ fn an_extended_run_keeps_its_schedule() {
     // The run records its new length.
     let outcome = resume(scene.path(), &run, "").ok();
     assert!(outcome.stdout.contains("all 65 iterations are done"), "{}", outcome.stdout);
+}
+
+/// Removes a parameter of `diet` from the description in a checkpoint, as if it had been written before the parameter
+/// existed.
+fn remove_parameter(checkpoint: &Path, name: &str) {
+    let bytes = read(checkpoint);
+    let (length, rest) = bytes.split_at(8);
+    let length = u64::from_le_bytes(length.try_into().expect("eight bytes"));
+    let (header, arrays) = rest.split_at(length.try_into().expect("a header in memory"));
+    let mut header: Value = serde_json::from_slice(header).expect("a header");
+    let metadata = &mut header["__metadata__"];
+    let contents = metadata["densify.header"].as_str().expect("a description");
+    let mut contents: Value = serde_json::from_str(contents).expect("a description");
+    let parameters = contents["header"]["config"]["policy_set"]["diet"].as_object_mut();
+    parameters.and_then(|all| all.remove(name)).expect("the parameter");
+    let contents = contents.to_string();
+    metadata["densify.crc32c"] = format!("{:08x}", crc32c::crc32c(contents.as_bytes())).into();
+    metadata["densify.header"] = contents.into();
+    let mut header = header.to_string().into_bytes();
+    header.resize(header.len().next_multiple_of(8), b' ');
+    let length = (header.len() as u64).to_le_bytes();
+    std::fs::write(checkpoint, [&length, &header[..], arrays].concat()).expect("a checkpoint");
+}
+
+/// The scene has few views, for which the policy chooses L1.
+#[test]
+fn a_run_of_before_the_pixel_loss_is_resumed_with_what_it_used() {
+    let scene = Photographs::colmap_text();
+    for used in ["l1", "huber"] {
+        let (root, run) = scratch();
+        train_short(&scene, &run, &format!("--policy-set diet.pixel_loss={used}"));
+        let part = root.path().join("part");
+        copy_unfinished(&run, &part, 40);
+        remove_parameter(&checkpoint(&part, 30), "pixel_loss");
+        let again = root.path().join("again");
+        copy_unfinished(&part, &again, 40);
+        let outcome = resume(scene.path(), &part, "").ok();
+        let note = format!("goes on with diet.pixel_loss={used}");
+        assert!(outcome.stdout.contains(&note), "{used}: {}", outcome.stdout);
+        assert!(model(&part, 40) == model(&run, 40), "{used}: another model");
+        // The resumed run has the parameter.
+        let set = &config(&part)["policy_set"]["diet"]["pixel_loss"];
+        assert_eq!(set.as_str(), Some(used));
+        resume(scene.path(), &part, "").ok();
+        // One who knows better may say so, unless the step sizes are those of L1.
+        let other = if used == "l1" { "huber" } else { "l1" };
+        let flag = format!("--policy-set diet.pixel_loss={other}");
+        resume(scene.path(), &run, &flag).refused(used, &["--policy-set diet.pixel_loss"]);
+        let outcome = resume(scene.path(), &again, &flag);
+        if used == "l1" {
+            outcome.refused(used, &["--lr noise_end"]);
+        } else {
+            outcome.ok();
+            assert!(model(&again, 40) != model(&run, 40), "{other} changes nothing");
+        }
+    }
 }
 
 #[test]

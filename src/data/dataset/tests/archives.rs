@@ -196,6 +196,9 @@ fn models_are_not_datasets() {
     let inside = pack(&model, "scene/", CompressionMethod::Stored);
     assert!(!is_archive(&Packed::new(&inside).path()), "in a folder");
     let archive = Packed::new(&packed(&Made::colmap_txt()));
+    let streamed = ["lod-meta.json", "0_0/meta.json"].map(|name| (name.to_owned(), b"{}".to_vec()));
+    let streamed = Packed::new(&pack(&streamed, "", CompressionMethod::Stored));
+    assert!(!is_archive(&streamed.path()), "streamed");
     assert!(is_archive(&archive.path()) && !is_archive(archive.folder.path()));
     refused("a model", &pack(&model, "", CompressionMethod::Stored), "is not a dataset");
 }

@@ -1,7 +1,7 @@
 //! Tests of the places where masks are found, and of what masks hide.
 
 use super::super::*;
-use super::{assert_noted, load, load_with, write_mask};
+use super::{assert_noted, load, load_with, refused, write_mask};
 use densify_fixtures::{Made, NAMES, SIZE, image};
 
 #[test]
@@ -80,6 +80,73 @@ fn listed_photographs_are_no_masks() {
     }
     let half = LoadOptions { resolution: Some(Resolution::Divisor(2)), ..LoadOptions::default() };
     assert!(load_with(&made, &half).train.iter().all(|view| view.source.mask.is_none()));
+}
+
+/// Photographs for training and for tests have the same names in two folders, as in NeRF-synthetic scenes.
+#[test]
+fn masks_belong_to_photographs_of_one_split() {
+    let made = |test: &str, masks: [Option<&str>; 2]| {
+        let made = Made::transforms(|_| ());
+        let json: serde_json::Value =
+            serde_json::from_slice(&std::fs::read(made.file("transforms.json")).unwrap()).unwrap();
+        for (at, (file, listed)) in
+            [("transforms_train.json", "train/r_0"), ("transforms_test.json", test)]
+                .into_iter()
+                .enumerate()
+        {
+            let mut part = json.clone();
+            let mut frame = json["frames"][at].clone();
+            frame["file_path"] = format!("./{listed}").into();
+            if let Some(mask) = masks[at] {
+                frame["mask_path"] = mask.into();
+            }
+            part["frames"] = vec![frame].into();
+            made.write(file, part.to_string());
+            image(&made.file(&format!("{listed}.png")), SIZE, 9);
+        }
+        made
+    };
+    let masked = |made: &Made, options: &LoadOptions| {
+        let data = load_with(made, options);
+        assert_eq!((data.train.len(), data.test.len()), (1, 1));
+        [&data.train, &data.test].map(|views| views[0].source.mask.is_some())
+    };
+    let plain = LoadOptions::default();
+    for (mask, expected) in [
+        ("masks/train/r_0.png", [true, false]),
+        ("masks/test/r_0.png", [false, true]),
+        ("masks/r_0.png", [false, false]),
+        ("train/r_0_mask.png", [true, false]),
+        ("test/r_0.mask.png", [false, true]),
+        ("test/dynamic_mask_r_0.png", [false, true]),
+    ] {
+        let made = made("test/r_0", [None; 2]);
+        write_mask(&made.file(mask), |x| if x < 10 { 0 } else { 255 });
+        assert_eq!(masked(&made, &plain), expected, "{mask}");
+    }
+    for (masks, expected) in [
+        ([None, Some("m/b.png")], [false, true]),
+        ([Some("./m/b.png"), None], [true, false]),
+        ([Some("m/b.png"), Some("m/b.png")], [true, true]),
+    ] {
+        let made = made("test/r_0", masks);
+        write_mask(&made.file("m/b.png"), |_| 255);
+        assert_eq!(masked(&made, &plain), expected, "{masks:?}");
+    }
+    // A photograph for tests is no mask of one for training.
+    assert_eq!(masked(&made("train/r_0_mask", [None; 2]), &plain), [false, false]);
+    // Paths of another machine lead to the masks of their own folders, or are refused.
+    let own = ["/x/train/masks/r_0.png", "/x/test/masks/r_0.png"].map(Some);
+    let there = LoadOptions { images: Some(".".into()), ..LoadOptions::default() };
+    let separate = made("test/r_0", own);
+    for file in ["train/masks/r_0.png", "test/masks/r_0.png"] {
+        write_mask(&separate.file(file), |_| 255);
+    }
+    assert_eq!(masked(&separate, &there), [true, true]);
+    let shared = made("test/r_0", own);
+    write_mask(&shared.file("masks/r_0.png"), |_| 255);
+    let words = "mask_path, /x/train/masks/r_0.png, /x/test/masks/r_0.png, copy the folders";
+    refused("one file", &shared, &there, words);
 }
 
 #[test]

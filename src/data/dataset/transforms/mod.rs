@@ -57,8 +57,10 @@ fn read_pair(root: &Root, options: &LoadOptions) -> Result<Option<Scene>, LoadEr
         return Ok(None);
     }
     let folders = Folders::new(root, options, false)?;
-    let mut scene = read(root, &folders, PAIR[0], DeclaredSplit::Train)?;
-    let test = read(root, &folders, PAIR[1], DeclaredSplit::Test)?;
+    // A photograph of one file is no mask of one in the other.
+    let names: Vec<String> = PAIR.iter().flat_map(|name| photographs(root, name)).collect();
+    let mut scene = read(root, &folders, (PAIR[0], &names), DeclaredSplit::Train)?;
+    let test = read(root, &folders, (PAIR[1], &names), DeclaredSplit::Test)?;
     scene.frames.extend(test.frames);
     scene.notes.extend(test.notes);
     scene.own_split = true;
@@ -77,7 +79,17 @@ fn read_single(root: &Root, options: &LoadOptions) -> Result<Option<Scene>, Load
         Split::Every(_) => DeclaredSplit::Train,
         Split::None | Split::Eval => DeclaredSplit::InLists,
     };
-    read(root, &Folders::new(root, options, false)?, SINGLE, declared).map(Some)
+    read(root, &Folders::new(root, options, false)?, (SINGLE, &[]), declared).map(Some)
+}
+
+/// The photographs that a file lists. Faults are found where it is [`read`].
+fn photographs(root: &Root, name: &str) -> Vec<String> {
+    let path = root.path().join(name);
+    let is_inside = root.existing(DataPath { file: &path, field: "the file", value: name }).is_ok();
+    let read = is_inside.then(|| json::read(&path).ok()).flatten().unwrap_or_default();
+    let frames = read.get("frames").and_then(Value::as_array).into_iter().flatten();
+    let names = frames.filter_map(|frame| frame.get("file_path")?.as_str().map(str::to_owned));
+    names.collect()
 }
 
 /// The source of the division of a file's frames into those for training and those for tests.
@@ -91,11 +103,11 @@ enum DeclaredSplit {
     InLists,
 }
 
-/// Reads the file `name`.
+/// Reads the file `name`. `others` are photographs besides those that it lists.
 fn read(
     root: &Root,
     folders: &Folders,
-    name: &str,
+    (name, others): (&str, &[String]),
     declared: DeclaredSplit,
 ) -> Result<Scene, LoadError> {
     let path = root.path().join(name);
@@ -111,6 +123,7 @@ fn read(
     }
     let names = listed.iter().filter_map(|(fields, _)| fields.text("file_path").ok().flatten());
     let places = [folders];
+    let names = names.chain(others.iter().map(String::as_str));
     let photographs = Listed::new(&places, &path, names);
     let (mut frames, mut missing, mut fell_back) = (Vec::new(), Vec::new(), 0);
     let (mut first_missing, mut bad) = (None, Vec::new());

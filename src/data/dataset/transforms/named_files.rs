@@ -136,7 +136,8 @@ impl Fields<'_> {
         // of masks are searched. The bare file name does not count, as a photograph may have the same name.
         for value in named.suffixes()?.filter(|end| end.contains('/')) {
             if let Some(found) = root.existing(DataPath { value: &value, ..named })? {
-                return Ok(MaskFile::black_hides(found));
+                let listed = Some(named.value.to_owned());
+                return Ok(MaskFile { listed, ..MaskFile::black_hides(found) });
             }
         }
         folders.mask(image, named, listed)?.ok_or_else(|| {

@@ -5,6 +5,7 @@ use std::path::Path;
 use super::layout::{BOUNDS, CHUNK, WORDS};
 use crate::error::LoadError;
 use crate::models::ply::layout::{OFFSET, sh_degree};
+use crate::models::ply::unread;
 use crate::models::quantise::{from_smallest_three, quantised_logit};
 use crate::models::rows::{Row, Rows, SplatFile};
 use crate::models::statement::stated_in_comments;
@@ -25,8 +26,8 @@ pub(super) fn is_compressed(path: &Path) -> Result<bool, LoadError> {
 /// Reads a compressed splat PLY.
 ///
 /// # Errors
-/// When the file is unreadable or contradicts itself, a property is missing, or more than 1 % of the Gaussians are not
-/// finite.
+/// When the file is unreadable or contradicts itself, a property is missing or changes what is shown but is not read, or
+/// more than 1 % of the Gaussians are not finite.
 pub(super) fn read(path: &Path) -> Result<SplatFile, LoadError> {
     let mut ply = Ply::open(path)?;
     let (chunk, vertex) = (ply.element("chunk")?, ply.element("vertex")?);
@@ -50,11 +51,18 @@ pub(super) fn read(path: &Path) -> Result<SplatFile, LoadError> {
     }
     let has_colour_bounds = chunk.find(&["min_r"]).is_some();
     let bounds = if has_colour_bounds { &BOUNDS[..] } else { &BOUNDS[..12] };
-    let bounds = columns(path, &chunk, bounds.iter().map(|&name| name.to_owned()))?;
-    let words = columns(path, &vertex, WORDS.iter().map(|&name| name.to_owned()))?;
+    let mut unread = Vec::new();
+    let mut columns = |element: &Element, names: Vec<String>| {
+        let columns = columns(path, element, &names)?;
+        unread.extend(unread::note(path, element, &names)?);
+        Ok::<_, LoadError>(columns)
+    };
+    let names = |names: &[&str]| names.iter().map(|&name| name.to_owned()).collect();
+    let bounds = columns(&chunk, names(bounds))?;
+    let words = columns(&vertex, names(&WORDS))?;
     let coefficients = match &sh {
         None => Vec::new(),
-        Some(sh) => columns(path, sh, (0..rest).map(|i| format!("f_rest_{i}")))?,
+        Some(sh) => columns(sh, (0..rest).map(|i| format!("f_rest_{i}")).collect())?,
     };
 
     let (mut chunks, mut vertices, mut bands) = (Vec::new(), Vec::new(), Vec::new());
@@ -93,7 +101,7 @@ pub(super) fn read(path: &Path) -> Result<SplatFile, LoadError> {
     let mut file = rows.finish(path)?;
     file.gaussians.origin = ply.comment_numbers(OFFSET)?.unwrap_or_default();
     file.gaussians.antialiasing = antialiasing;
-    file.notes.extend(note);
+    file.notes.extend(note.into_iter().chain(unread));
     Ok(file)
 }
 
@@ -139,12 +147,8 @@ fn band(byte: u8) -> f32 {
     (share - 0.5) * 8.0
 }
 
-fn columns(
-    path: &Path,
-    element: &Element,
-    names: impl Iterator<Item = String>,
-) -> Result<Vec<usize>, LoadError> {
+fn columns(path: &Path, element: &Element, names: &[String]) -> Result<Vec<usize>, LoadError> {
     let remedy = "a compressed splat PLY has packed_position, packed_rotation, packed_scale and packed_color, \
                   and chunks with their bounds";
-    names.map(|name| element.column(path, &name, remedy)).collect()
+    names.iter().map(|name| element.column(path, name, remedy)).collect()
 }

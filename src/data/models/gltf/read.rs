@@ -38,6 +38,17 @@ const READ: [(&str, &[&str]); 3] = [
 /// original renderer, which differs little.
 const SORTED: &str = "cameraDistance";
 
+/// The kinds of primitives, by their `mode`. Splats are points.
+const MODES: [&str; 7] = [
+    "points",
+    "lines",
+    "a line loop",
+    "a line strip",
+    "triangles",
+    "a triangle strip",
+    "a triangle fan",
+];
+
 /// Largest accepted opacity: 1 plus rounding errors.
 const MAX_OPACITY: f32 = 1.001;
 
@@ -72,6 +83,8 @@ struct Mesh {
 #[derive(Deserialize)]
 struct Primitive {
     attributes: BTreeMap<String, usize>,
+    mode: Option<u64>,
+    indices: Option<IgnoredAny>,
     #[serde(default)]
     extensions: BTreeMap<String, Value>,
 }
@@ -249,6 +262,7 @@ fn splats(
             return Err(LoadError::damaged(path, format!("{SPLATS}: {key}"), problem));
         }
     }
+    check_points(path, primitive)?;
     let other_order = extension.get("sortingMethod").filter(|stated| *stated != SORTED);
     let other_order = other_order.map(|stated| {
         let stated = shortened(&stated.to_string());
@@ -335,6 +349,22 @@ fn splats(
         );
     }
     Ok(file)
+}
+
+/// Refuses a primitive that is not points, and one that shows only some of its vertices.
+fn check_points(path: &Path, primitive: &Primitive) -> Result<(), LoadError> {
+    let fail = |field: &str, problem: String| {
+        Err(LoadError::damaged(path, format!("meshes: primitives: {field}"), problem))
+    };
+    if let Some(mode) = primitive.mode.filter(|&mode| mode != 0) {
+        let kind = usize::try_from(mode).ok().and_then(|mode| MODES.get(mode));
+        let kind = kind.unwrap_or(&"unknown");
+        return fail("mode", format!("{mode} is {kind}, but splats ({SPLATS}) are points, mode 0"));
+    }
+    if primitive.indices.is_some() {
+        return fail("indices", "densify reads splats in the order of their attributes".to_owned());
+    }
+    Ok(())
 }
 
 /// Refuses coefficients of spherical harmonics beyond `sh_degree`, the degree that is read.

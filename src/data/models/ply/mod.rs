@@ -4,7 +4,7 @@
 pub(super) mod activation;
 pub(super) mod layout;
 mod read;
-mod unread;
+pub(super) mod unread;
 mod write;
 
 use super::{Format, Match, Reader};

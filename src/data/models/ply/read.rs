@@ -52,10 +52,11 @@ pub(super) fn read(path: &Path) -> Result<SplatFile, LoadError> {
         .iter()
         .map(|name| vertices.column(path, name, remedy))
         .collect::<Result<Vec<_>, _>>()?;
-    let unread = unread::note(path, &vertices, &names)?;
     let (antialiasing, note) = stated_in_comments(path, ply.comments())?;
     let filter = vertices.find(&[FILTER]);
     columns.extend(filter);
+    let names = [names, filter.map(|_| FILTER.to_owned()).into_iter().collect()].concat();
+    let unread = unread::note(path, &vertices, &names)?;
 
     let offset = ply.comment_numbers(OFFSET)?;
     let is_double = |column: &usize| vertices.properties[*column].kind == Scalar::F64;

@@ -2,13 +2,12 @@
 
 use std::path::Path;
 
-use super::layout::FILTER;
 use crate::error::LoadError;
 use crate::ply::Element;
 use densify_core::files::one_line;
 
 /// Properties that change nothing: the normals of the original trainer, and plain colours beside the coefficients.
-const HARMLESS: [&str; 7] = ["nx", "ny", "nz", "red", "green", "blue", FILTER];
+const HARMLESS: [&str; 6] = ["nx", "ny", "nz", "red", "green", "blue"];
 /// Maximum number of names in a note, and of characters of a name.
 const MAX_NAMES: usize = 5;
 const MAX_NAME: usize = 40;
@@ -20,18 +19,18 @@ const MOVING_WITH_TIME: [&str; 2] = ["scale_t", "rot_r_"];
 /// Beginning of the names of view-dependent colours of Spherical Beta models.
 const BETA: &str = "sb_params_";
 
-/// A note about the properties besides `read`, the names of those that are read.
+/// A note about the properties of an element besides `read`, the names of those that are read.
 ///
 /// # Errors
 /// When one of them makes the Gaussians move or gives them other view-dependent colours.
-pub(super) fn note(
+pub(in crate::models) fn note(
     path: &Path,
-    vertices: &Element,
+    element: &Element,
     read: &[String],
 ) -> Result<Option<String>, LoadError> {
-    let has_time = vertices.find(&["t"]).is_some();
+    let has_time = element.find(&["t"]).is_some();
     let mut unread = Vec::new();
-    for property in &vertices.properties {
+    for property in &element.properties {
         let name = &property.name;
         if read.contains(name) || HARMLESS.contains(&name.as_str()) {
             continue;

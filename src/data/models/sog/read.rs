@@ -13,7 +13,7 @@ use crate::models::quantise::{from_smallest_three, quantised_logit};
 use crate::models::rows::{Row, Rows, SplatFile};
 use crate::models::statement::{KERNEL, note, stated_in_json};
 use crate::models::zip::ZipReader;
-use crate::models::{ModelFile, siblings};
+use crate::models::{ModelFile, lists, siblings};
 use crate::picture_file;
 use densify_core::antialiasing::Antialiasing;
 use densify_core::files::max_unpacked_bytes;
@@ -117,6 +117,9 @@ pub(super) fn read(file: ModelFile<'_>) -> Result<SplatFile, LoadError> {
     }
     let mut archive = ZipReader::open(path, file.input, file.length)?;
     let Some(folder) = folder_in_archive(&archive.names()).map(str::to_owned) else {
+        if lists::is_streamed(&archive.names()) {
+            return Err(lists::refusal_of_archive(path));
+        }
         return Err(LoadError::Data(format!(
             "{} is a ZIP archive, but no SOG model (it needs exactly one {META}); unpack it, and name a file of Gaussian \
              splats",

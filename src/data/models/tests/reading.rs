@@ -98,6 +98,42 @@ fn archive(files: &[(&str, &[u8])]) -> Vec<u8> {
     archive.finish().unwrap().into_inner()
 }
 
+/// As in other PLY files: properties that change the look are refused, all others are named.
+#[test]
+fn properties_of_compressed_ply_that_are_not_read_are_refused_or_noted() {
+    let whole = std::fs::read(corpus("compressed-ply/twelve.ply")).unwrap();
+    let end = whole.windows(11).position(|part| part == b"end_header\n").unwrap();
+    let (header, data) = (str::from_utf8(&whole[..end]).unwrap(), &whole[end + 11..]);
+    // The elements, each with the line after its properties, the number of its rows and their bytes.
+    let elements = [("chunk", "element vertex", 1, 72), ("vertex", "element sh", 12, 16)];
+    let elements = elements.into_iter().chain([("sh", "end_header", 12, 9)]);
+    let with = |changed: &str, names: &[&str]| {
+        let more: String = names.iter().map(|name| format!("property uchar {name}\n")).collect();
+        let (mut header, mut rows, mut left) = (format!("{header}end_header\n"), Vec::new(), data);
+        for (element, next, count, bytes) in elements.clone() {
+            let own;
+            (own, left) = left.split_at(count * bytes);
+            let padding = if element == changed { vec![0; names.len()] } else { Vec::new() };
+            rows.extend(own.chunks(bytes).flat_map(|row| [row, &padding].concat()));
+            if element == changed {
+                header = header.replace(next, &format!("{more}{next}"));
+            }
+        }
+        let (_folder, path) = saved("file.ply", [header.as_bytes(), &rows].concat());
+        read_model(&path).map_err(|error| error.to_string())
+    };
+    let plain = with("sh", &[]).unwrap();
+    assert!(plain.notes.is_empty(), "{:?}", plain.notes);
+    for element in ["chunk", "vertex", "sh"] {
+        let noted = with(element, &["label", "red", "filter_3D"]).unwrap();
+        assert_eq!(noted.notes, ["properties that are not read: label, filter_3D"], "{element}");
+        assert_eq!(noted.gaussians, plain.gaussians, "{element}");
+        let message = with(element, &["motion_0"]).unwrap_err();
+        let words = ["file.ply: property motion_0", "move", "single moment"];
+        assert!(words.iter().all(|word| message.contains(word)), "{element}: {message}");
+    }
+}
+
 #[test]
 fn an_archive_may_hold_the_folder_of_a_model() {
     let folder = sog_folder();
@@ -253,6 +289,13 @@ fn dishonest_files_are_refused_with_the_reason() {
             &["requires KHR_x"],
         ),
         ("linear colours", text(gltf, "srgb_rec709", "lin_rec709"), &["lin_rec709_display"]),
+        (
+            "triangles",
+            text(gltf, "\"mode\":0", "\"mode\":4"),
+            &["primitives: mode: 4 is triangles", "splats (KHR_gaussian_splatting) are points"],
+        ),
+        ("an unknown mode", text(gltf, "\"mode\":0", "\"mode\":7"), &["mode: 7 is unknown"]),
+        ("indices", text(gltf, "\"mode\":0", "\"indices\":0"), &["indices", "order"]),
         ("an uneven scale", text(gltf, "[2,2,2]", "[2,2,3]"), &["nodes", "even scale"]),
         (
             "a node in itself",
@@ -302,6 +345,15 @@ fn lists_of_models_are_refused_with_the_file_to_name() {
         let of_folder = read_model(folder.path()).unwrap_err().to_string();
         assert_eq!(is_model_folder(folder.path()), name == "lod-meta.json");
         assert_eq!(of_folder == message, name == "lod-meta.json", "{of_folder}");
+    }
+    for folder in ["", "city/"] {
+        let [list, model] =
+            ["lod-meta.json", "0_0/meta.json"].map(|name| format!("{folder}{name}"));
+        let (_folder, path) = saved("city.zip", archive(&[(&list, b"{}"), (&model, b"{}")]));
+        let message = read_model(&path).unwrap_err().to_string();
+        for words in ["city.zip is a streamed SOG", "levels of detail", "unpack it, and name one"] {
+            assert!(message.contains(words), "{folder:?}: {words:?} is not in: {message}");
+        }
     }
 }
 
