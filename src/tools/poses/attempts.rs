@@ -79,18 +79,14 @@ pub(crate) fn reconstruct(
         fs::create_dir_all(&folder)
             .map_err(densify_core::files::FileError::io("create the folder", &folder))?;
         let request = task.request(&folder, peak);
-        let counts = engine.run(
-            ("features", "features"),
-            request.clone(),
-            &folder.join("features.json"),
-            observer,
-        )?;
+        let counts =
+            engine.run("features", request.clone(), &folder.join("features.json"), observer)?;
         let keypoints = median(&counts["keypoints"]);
         observer.say(format_args!("features {keypoints} per photograph"));
         if level == 0 && keypoints < FEW_KEYPOINTS {
             continue;
         }
-        engine.run(("pairs", "pairs"), request.clone(), &folder.join("pairs.json"), observer)?;
+        engine.run("pairs", request.clone(), &folder.join("pairs.json"), observer)?;
         let mappers: &[&str] = if level == 0 {
             &["incremental", "global"]
         } else {
@@ -101,14 +97,14 @@ pub(crate) fn reconstruct(
             let mut request = request.clone();
             request["mapper"] = (*mapper).into();
             request["models"] = models.to_string_lossy().into();
-            let done = engine.run(
-                ("mapping", "poses"),
-                request,
-                &folder.join(format!("{mapper}.json")),
-                observer,
-            )?;
+            let done =
+                engine.run("mapping", request, &folder.join(format!("{mapper}.json")), observer)?;
             for number in done["models"].as_array().into_iter().flatten() {
-                let candidate = task.candidate(&models.join(number.to_string()), mapper)?;
+                let candidate =
+                    task.candidate(&models.join(number.to_string()), (mapper, level))?;
+                if candidate.model.images.len() < MIN_VIEWS {
+                    continue;
+                }
                 let (registered, accepted) =
                     (candidate.model.images.len(), candidate.verdict.accepted());
                 let hopeless =
@@ -174,7 +170,11 @@ impl Task<'_> {
     }
 
     /// Reads and checks a model.
-    fn candidate(&self, folder: &Path, mapper: &str) -> Result<Candidate, PosesError> {
+    fn candidate(
+        &self,
+        folder: &Path,
+        (mapper, level): (&str, usize),
+    ) -> Result<Candidate, PosesError> {
         let nonsense = |file: &str, problem: String| PosesError::Nonsense {
             file: folder.join(file),
             problem,
@@ -218,6 +218,7 @@ impl Task<'_> {
         };
         let views: Vec<View> = model.images.iter().map(view).collect();
         let verdict = checks::check(&views, &pairs);
-        Ok(Candidate { verdict, origin: format!("{mapper} mapper"), model })
+        let contrast = if level == 0 { "" } else { ", low contrast" };
+        Ok(Candidate { verdict, origin: format!("{mapper} mapper{contrast}"), model })
     }
 }

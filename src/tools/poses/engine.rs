@@ -21,8 +21,8 @@ const MIN_MAJOR: u32 = 4;
 const POLL_INTERVAL: Duration = Duration::from_millis(100);
 /// Pythons that are tried if none is named.
 const PYTHONS: [&str; 2] = ["python3", "python"];
-/// Tenths of a stage that are reported.
-const REPORTS: usize = 10;
+/// Parts of a stage that are reported.
+const PARTS: usize = 4;
 
 /// A Python with pycolmap, and the folder where it works.
 #[derive(Debug)]
@@ -77,7 +77,7 @@ impl Engine {
     /// When it fails or writes no JSON, or a signal asks to stop.
     pub(crate) fn run(
         &self,
-        (stage, title): (&str, &str),
+        stage: &str,
         mut request: Value,
         result: &Path,
         observer: &dyn Observer,
@@ -90,7 +90,7 @@ impl Engine {
             command.arg("-u").arg(&self.script).arg(stage).arg(&question);
             let threads = request["threads"].to_string();
             command.env("OMP_NUM_THREADS", threads);
-            run_logged((command, "pycolmap", title), &self.log, observer)?;
+            run_logged((command, "pycolmap", stage), &self.log, observer)?;
         }
         let text = fs::read_to_string(result).map_err(FileError::io("read", result))?;
         serde_json::from_str(&text).map_err(|error| {
@@ -105,12 +105,12 @@ impl Engine {
 /// # Errors
 /// When it cannot be started or fails, or a signal asks to stop; it is ended then.
 pub(crate) fn run_logged(
-    (mut command, program, title): (Command, &str, &str),
+    (mut command, program, task): (Command, &str, &str),
     log: &Path,
     observer: &dyn Observer,
 ) -> Result<(), PosesError> {
     let failed = |how: String, remedy| PosesError::Failed {
-        what: format!("{program} ({title})"),
+        what: format!("{program} ({task})"),
         how,
         log: log.to_owned(),
         remedy,
@@ -135,7 +135,7 @@ pub(crate) fn run_logged(
     let mut reported = String::new();
     loop {
         match receiver.recv_timeout(POLL_INTERVAL) {
-            Ok(line) => match progress(title, &line) {
+            Ok(line) => match progress(&line) {
                 Some(report) if report == reported => {}
                 Some(report) => {
                     observer.say(format_args!("{report}"));
@@ -165,13 +165,13 @@ pub(crate) fn run_logged(
     Err(failed(format!("{}: {last}", ending(status)), remedy(status, &last)))
 }
 
-/// The report of a line `progress WHAT DONE TOTAL`, in whole tenths.
-fn progress(title: &str, line: &str) -> Option<String> {
+/// The report of a line `progress WHAT DONE TOTAL`, in quarters.
+fn progress(line: &str) -> Option<String> {
     let words: Vec<&str> = line.strip_prefix("progress ")?.split(' ').collect();
-    let [_, done, total] = words[..] else { return None };
+    let [what, done, total] = words[..] else { return None };
     let (done, total): (usize, usize) = (done.parse().ok()?, total.parse().ok()?);
-    let tenths = REPORTS * done.min(total) / total.max(1);
-    Some(format!("{title:9}{} %", 100 * tenths / REPORTS))
+    let part = PARTS * done.min(total) / total.max(1);
+    Some(format!("{:8} {} %", files::one_line(what), 100 * part / PARTS))
 }
 
 const RERUN: &str = "the same command continues where it stopped";

@@ -349,3 +349,6 @@ fn tell(report: &Report, count: usize, observer: &dyn Observer) {
         }
     }
 }
+
+#[cfg(all(test, unix))]
+mod tests;
