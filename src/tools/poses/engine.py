@@ -223,12 +223,9 @@ STAGES = {"features": features, "pairs": pairs, "mapping": mapping}
 
 
 def main():
-    stage = sys.argv[1]
     import pycolmap
 
-    if stage == "version":
-        print(pycolmap.__version__)
-        return
+    stage = sys.argv[1]
     threading.Thread(target=end_with_parent, daemon=True).start()
     with open(sys.argv[2], encoding="utf-8") as file:
         ask = json.load(file)

@@ -15,6 +15,8 @@ use densify_run::Observer;
 
 /// The program that runs in Python.
 const SCRIPT: &str = include_str!("engine.py");
+/// Prints the version of pycolmap.
+const VERSION: &str = "import pycolmap; print(pycolmap.__version__)";
 /// Oldest version whose functions are those that the script calls.
 const MIN_MAJOR: u32 = 4;
 /// Interval between checks for a signal.
@@ -34,18 +36,15 @@ pub(crate) struct Engine {
 }
 
 impl Engine {
-    /// Finds pycolmap, and checks its version.
+    /// Finds pycolmap, and checks its version. Writes nothing.
     ///
     /// # Errors
     /// When no Python has it, or it is too old.
     pub(crate) fn find(python: Option<&Path>, work: &Path) -> Result<Self, PosesError> {
-        let script = work.join("engine.py");
-        write_atomically(&script, |out| out.write_all(SCRIPT.as_bytes()))?;
         let candidates: Vec<&Path> =
             python.map_or_else(|| PYTHONS.map(Path::new).to_vec(), |python| vec![python]);
         for python in &candidates {
-            let answer =
-                Command::new(python).arg(&script).arg("version").stdin(Stdio::null()).output();
+            let answer = Command::new(python).args(["-c", VERSION]).stdin(Stdio::null()).output();
             let Some(answer) = answer.ok().filter(|answer| answer.status.success()) else {
                 continue;
             };
@@ -59,11 +58,16 @@ impl Engine {
                     python: python.display().to_string(),
                 });
             }
-            let (python, log) = (python.to_path_buf(), work.join("log.txt"));
-            return Ok(Self { python, version, script, log });
+            let [script, log] = ["engine.py", "log.txt"].map(|name| work.join(name));
+            return Ok(Self { python: python.to_path_buf(), version, script, log });
         }
         let tried = candidates[0].display().to_string();
         Err(PosesError::NoEngine { tried })
+    }
+
+    /// Writes the script into the folder of intermediate results.
+    pub(crate) fn install(&self) -> Result<(), PosesError> {
+        Ok(write_atomically(&self.script, |out| out.write_all(SCRIPT.as_bytes()))?)
     }
 
     /// Name and version, for messages and reports.

@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use densify_core::files::FileError;
+use densify_core::numbers::counted;
 use densify_data::LoadError;
 use densify_run::Interrupt;
 use densify_run::failure::Failure;
@@ -52,7 +53,10 @@ pub enum PosesError {
         work: PathBuf,
     },
     /// The folder has too few photographs.
-    #[error("{}: {count} photographs are too few, at least {needed} are needed{}", folder.display(), listed(notes))]
+    #[error(
+        "{} has {}, but at least {needed} are needed{}",
+        folder.display(), counted(*count, "photograph"), listed(notes)
+    )]
     TooFew {
         /// The folder.
         folder: PathBuf,

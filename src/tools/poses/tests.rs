@@ -110,7 +110,7 @@ impl Place {
             .collect();
         let script = format!(
             r#"#!/bin/sh
-[ "$2" != version ] || {{ echo {version}; exit; }}
+[ "$1" != -c ] || {{ echo {version}; exit; }}
 stage=$3
 echo $stage >>'{root}/stages'
 field() {{ sed 's/.*"'$1'":"\([^"]*\)".*/\1/' "$request"; }}
@@ -250,11 +250,11 @@ fn a_crash_is_one_message_and_the_next_call_continues() {
 
 #[test]
 fn nonsense_is_refused_and_says_what_to_remove() {
-    let cases: [(&str, &dyn Fn(&mut Model)); 4] = [
-        ("none of the photographs", &|model| model.images[2].name = "../../other.png".to_owned()),
-        ("which does not exist", &|model| model.images[2].camera = 9),
-        ("no rotation", &|model| model.images[2].translation.x = f64::NAN),
-        ("the parameters", &|model| model.cameras[0].parameters[0] = f64::INFINITY),
+    let cases: [(&str, fn(&mut Model)); 4] = [
+        ("none of the photographs", |model| model.images[2].name = "../../other.png".to_owned()),
+        ("which does not exist", |model| model.images[2].camera = 9),
+        ("no rotation", |model| model.images[2].translation.x = f64::NAN),
+        ("the parameters", |model| model.cameras[0].parameters[0] = f64::INFINITY),
     ];
     for (words, change) in cases {
         let place = Place::new(COUNT);
@@ -334,8 +334,15 @@ fn five_photographs_are_enough_and_two_are_not() {
     let place = Place::new(2);
     std::fs::write(place.path("photos/a.HEIC"), "").expect("a file");
     std::fs::write(place.path("photos/a.mov"), "").expect("a file");
-    let message =
-        place.refused(2, &["2 photographs are too few", "a.HEIC", "Most Compatible", "Live Photo"]);
+    let message = place.refused(
+        2,
+        &[
+            "has 2 photographs, but at least 3 are needed",
+            "a.HEIC",
+            "Most Compatible",
+            "Live Photo",
+        ],
+    );
     assert_eq!(message.lines().count(), 1);
 }
 

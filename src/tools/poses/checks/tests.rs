@@ -69,10 +69,7 @@ fn parts_without_a_common_pair_are_split_and_views_without_points_or_far_away_ar
         .collect();
     let verdict = check(&views, &apart);
     assert_eq!(verdict.accepted(), 8);
-    assert!(
-        verdict.reasons[8..].iter().any(|reason| *reason == Some(Reason::Apart)),
-        "{verdict:?}"
-    );
+    assert!(verdict.reasons[8..].contains(&Some(Reason::Apart)), "{verdict:?}");
     let (_, pairs) = ring(12);
     views[3].points = 12;
     assert_eq!(check(&views, &pairs).reasons[3], Some(Reason::FewPoints { points: 12 }));
