@@ -74,6 +74,12 @@ pub(crate) fn reconstruct(
     observer: &dyn Observer,
 ) -> Result<Vec<Candidate>, PosesError> {
     let mut found: Vec<Candidate> = Vec::new();
+    if !task.is_sequence && task.names.len() > ALL_PAIRS {
+        observer.say(format_args!(
+            "note     over {ALL_PAIRS} photographs: each is compared with its neighbours by name, and every tenth with \
+             every tenth"
+        ));
+    }
     for (level, peak) in PEAK_THRESHOLDS.into_iter().enumerate() {
         let folder = task.work.join(format!("attempt{level}"));
         fs::create_dir_all(&folder)

@@ -31,20 +31,17 @@ pub(crate) fn take_frames(
     if folder.is_dir() {
         return Ok(());
     }
-    let seconds = duration(video)?;
+    let (seconds, native) = duration(video)?;
     let (all, taken) = (folder.with_extension("all"), folder.with_extension("partial"));
     for folder in [&all, &taken] {
         let _ = fs::remove_dir_all(folder);
         fs::create_dir_all(folder).map_err(FileError::io("create the folder", folder))?;
     }
-    let rate = OVERSAMPLING * f64::from(wanted) / seconds;
+    // A higher rate than the video's own would repeat frames.
+    let rate = (OVERSAMPLING * f64::from(wanted) / seconds).min(native);
     let mut command = Command::new("ffmpeg");
     command.args(["-nostdin", "-v", "error", "-i"]).arg(video);
-    // Frames are dropped, never repeated, where the video has fewer per second.
-    let select = format!("select='isnan(prev_selected_t)+gte(t-prev_selected_t\\,{})'", 1.0 / rate);
-    command
-        .args(["-vf", &select, "-fps_mode", "passthrough", "-q:v", "2"])
-        .arg(all.join("%06d.jpg"));
+    command.args(["-vf", &format!("fps={rate}"), "-q:v", "2"]).arg(all.join("%06d.jpg"));
     run_logged((command, "ffmpeg", "frames"), log, observer)?;
     let mut frames: Vec<PathBuf> = fs::read_dir(&all)
         .map_err(FileError::io("read the folder", &all))?
@@ -70,8 +67,8 @@ pub(crate) fn take_frames(
     Ok(())
 }
 
-/// The length of a video `[s]`.
-fn duration(video: &Path) -> Result<f64, PosesError> {
+/// The length of a video `[s]`, and its frames per second.
+fn duration(video: &Path) -> Result<(f64, f64), PosesError> {
     let fault = |problem: String| PosesError::Video { file: video.to_owned(), problem };
     let described = Command::new("ffmpeg")
         .args(["-nostdin", "-hide_banner", "-i"])
@@ -88,9 +85,10 @@ fn duration(video: &Path) -> Result<f64, PosesError> {
              switched off"
         )));
     }
-    parse_duration(&text).filter(|seconds| *seconds > 0.0).ok_or_else(|| {
+    let seconds = parse_duration(&text).filter(|seconds| *seconds > 0.0).ok_or_else(|| {
         fault("ffmpeg finds no video of known length in it; give a complete video file".to_owned())
-    })
+    })?;
+    Ok((seconds, parse_rate(&text).unwrap_or(f64::INFINITY)))
 }
 
 /// The seconds of the line `Duration: 00:01:02.50, …`.
@@ -104,6 +102,12 @@ fn parse_duration(text: &str) -> Option<f64> {
         seconds = 60.0 * seconds + part.parse::<f64>().ok()?;
     }
     Some(seconds)
+}
+
+/// The number before ` fps` in the line of the video.
+fn parse_rate(text: &str) -> Option<f64> {
+    let (before, _) = text.split_once(" fps")?;
+    before.rsplit(' ').next()?.parse().ok().filter(|rate| *rate > 0.0)
 }
 
 /// Variance of the Laplacian: comparable only between frames that show the same.
@@ -137,6 +141,7 @@ mod tests {
             "  Duration: 00:01:02.50, start: 0.0, bitrate: 9 kb/s\n  Stream #0:0: Video: h264\n";
         assert_eq!(parse_duration(text), Some(62.5));
         assert_eq!(parse_duration("Duration: N/A, Video:"), None);
+        assert_eq!(parse_rate("Video: h264, yuv420p, 640x480, 29.97 fps, 30 tbr"), Some(29.97));
         assert_eq!(parse_duration("Duration: 00:00:02.0, Audio: aac"), None);
     }
 

@@ -118,9 +118,10 @@ impl Verdict {
         self.reasons.iter().filter(|reason| reason.is_none()).count()
     }
 
-    /// True if so many views are contradicted that the others are not to be believed either.
+    /// True if so many views are contradicted or rejected that the others are not to be believed either.
     pub(crate) fn is_hopeless(&self) -> bool {
-        self.contradicted as f64 > MAX_CONTRADICTED * self.reasons.len() as f64
+        let views = self.reasons.len();
+        self.contradicted as f64 > MAX_CONTRADICTED * views as f64 || 2 * self.accepted() < views
     }
 }
 
