@@ -217,10 +217,13 @@ impl Task<'_> {
                 .filter(|direction| direction.length_squared() > 0.0);
             pairs.push(Pair { views: [first, second], inliers, rotation, direction });
         }
+        let focal: HashMap<u32, f64> =
+            model.cameras.iter().map(|camera| (camera.id, camera.parameters[0])).collect();
         let view = |image: &crate::model::Image| View {
             rotation: image.rotation,
             translation: image.translation,
             points: image.points(),
+            focal_px: focal[&image.camera],
         };
         let views: Vec<View> = model.images.iter().map(view).collect();
         let verdict = checks::check(&views, &pairs);

@@ -8,7 +8,7 @@ fn ring(count: usize) -> (Vec<View>, Vec<Pair>) {
         .map(|step| {
             let rotation =
                 DQuat::from_rotation_y(step as f64 * std::f64::consts::TAU / count as f64);
-            View { rotation, translation: DVec3::new(0.0, 0.0, 3.0), points: 100 }
+            View { rotation, translation: DVec3::new(0.0, 0.0, 3.0), points: 100, focal_px: 500.0 }
         })
         .collect();
     let pairs = (0..count).flat_map(|first| (1..4).map(move |gap| [first, (first + gap) % count]));
@@ -92,4 +92,13 @@ fn a_model_in_which_many_views_are_contradicted_is_not_believed() {
         })
         .collect();
     assert!(check(&views, &strong).is_hopeless());
+}
+
+#[test]
+fn short_focal_lengths_have_larger_limits() {
+    let (mut views, pairs) = ring(12);
+    views[5].rotation = DQuat::from_rotation_x(0.05) * views[5].rotation;
+    assert!(check(&views, &pairs).reasons[5].is_some());
+    views.iter_mut().for_each(|view| view.focal_px = 190.0);
+    assert_eq!(check(&views, &pairs).accepted(), 12);
 }
