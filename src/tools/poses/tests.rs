@@ -157,6 +157,9 @@ esac
     }
 }
 
+/// A fault in a model.
+type Change = fn(&mut Model);
+
 /// A model of photographs on a ring, all of which see the same points.
 fn ring(photographs: std::ops::Range<usize>) -> Model {
     let image = |number: usize| {
@@ -250,7 +253,7 @@ fn a_crash_is_one_message_and_the_next_call_continues() {
 
 #[test]
 fn nonsense_is_refused_and_says_what_to_remove() {
-    let cases: [(&str, fn(&mut Model)); 4] = [
+    let cases: [(&str, Change); 4] = [
         ("none of the photographs", |model| model.images[2].name = "../../other.png".to_owned()),
         ("which does not exist", |model| model.images[2].camera = 9),
         ("no rotation", |model| model.images[2].translation.x = f64::NAN),
