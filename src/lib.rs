@@ -48,6 +48,7 @@ pub use densify_data as data;
 pub use densify_inspect as inspect;
 pub use densify_launch as launch;
 pub use densify_mesh as mesh;
+pub use densify_poses as poses;
 pub use densify_render as render;
 pub use densify_run as run;
 #[cfg(feature = "selftest")]

@@ -28,6 +28,7 @@ mod knobs;
 mod mesh;
 mod plan;
 mod policies;
+mod poses;
 mod progress;
 mod render;
 #[cfg(feature = "study")]
@@ -64,7 +65,7 @@ use without::{report, study};
 /// Trains 3D Gaussian Splatting scenes under a hard memory budget.
 ///
 /// A scene is a folder of photographs whose cameras are known: a COLMAP reconstruction, a
-/// NeRF-synthetic scene or a nerfstudio dataset. The result is a .ply that any viewer of Gaussian
+/// NeRF-synthetic scene or a nerfstudio dataset; `densify poses` finds unknown ones. The result is a .ply that any viewer of Gaussian
 /// splats opens.
 #[derive(Debug, Parser)]
 #[command(name = "densify", version, propagate_version = true, after_help = EXAMPLES)]
@@ -78,6 +79,7 @@ Examples:
   densify train scene:spheres -i 2000                      train on a built-in scene: no file needed
   densify train data/garden --eval                         train, hold out every 8th photograph
   densify train data/garden --policy vanilla --budget 1M   another policy, at most a million Gaussians
+  densify poses photos -o data/garden                      the cameras of photographs or of a video
   densify plan data/garden --memory 512MiB                 the largest model that fits this memory
   densify eval output/garden-diet                          PSNR and SSIM of the photographs held out
   densify render output/garden-diet -o pictures            those views, rendered to PNG files
@@ -128,6 +130,7 @@ enum Command {
     Devices(devices::DevicesArgs),
     Knobs(knobs::KnobsArgs),
     Policies(policies::PoliciesArgs),
+    Poses(Box<poses::PosesArgs>),
     Scenegen(Box<scenegen::ScenegenArgs>),
     Selftest(selftest::SelftestArgs),
     #[command(hide = true)]
@@ -167,7 +170,7 @@ pub fn run_with(arguments: impl IntoIterator<Item = impl Into<OsString> + Clone>
     let (_, given) = matches.subcommand().unwrap_or(("", &matches));
     let instructions = InstructionSet::from_environment().map_err(Failure::input);
     let done = instructions.and_then(|_| match arguments.command {
-        Command::Train(train) => train::run(&train, given, &console),
+        Command::Train(mut train) => train::run(&mut train, given, &console),
         Command::Blocks(args) => blocks::run(&args, &console),
         Command::Plan(train) => plan::run(&train, given, &console),
         Command::Eval(eval) => eval::run(&eval, given, &console),
@@ -181,6 +184,7 @@ pub fn run_with(arguments: impl IntoIterator<Item = impl Into<OsString> + Clone>
         Command::Devices(devices) => devices::run(&devices, &console),
         Command::Knobs(knobs) => knobs::run(&knobs, &console),
         Command::Policies(policies) => policies::run(&policies, &console),
+        Command::Poses(args) => poses::run(&args, &console),
         Command::Scenegen(scenegen) => scenegen::run(&scenegen, &console),
         Command::StudyRun(run) => study::run(&run, &console),
         Command::Trade(trade) => study::trade(&trade, &console),

@@ -101,6 +101,7 @@ const LAYERS: [&[(&str, &str)]; 9] = [
         ("densify-inspect", "src/tools/inspect"),
         ("densify-launch", "src/tools/launch"),
         ("densify-mesh", "src/tools/mesh"),
+        ("densify-poses", "src/tools/poses"),
     ],
     &[
         ("densify-blocks", "src/tools/blocks"),

@@ -15,6 +15,7 @@ use clap::{ArgMatches, Args};
 use super::console::Console;
 use super::flags;
 use super::interrupt::Interrupts;
+use super::poses;
 use super::progress::Progress;
 use super::threads;
 use densify_run as run;
@@ -26,7 +27,8 @@ use densify_train::output::RunFolder;
 ///
 /// SCENE is a folder with a COLMAP reconstruction (images/ and sparse/0/), a NeRF-synthetic scene
 /// (transforms_train.json and transforms_test.json) or a nerfstudio dataset (transforms.json); or a
-/// built-in scene by name, such as scene:spheres (`densify scenegen --list` shows them).
+/// built-in scene by name, such as scene:spheres (`densify scenegen --list` shows them). Of a folder of
+/// photographs or a video, the cameras are found first, as by `densify poses`, into output/NAME-poses.
 #[derive(Debug, Args)]
 #[command(after_help = EXAMPLES)]
 pub(super) struct TrainArgs {
@@ -95,11 +97,16 @@ impl TrainArgs {
 }
 
 pub(super) fn run(
-    args: &TrainArgs,
+    args: &mut TrainArgs,
     matches: &ArgMatches,
     console: &Console,
 ) -> Result<(), Failure> {
     let follower = Follower { verbose: args.verbose, ..Follower::new(console) };
+    if let Some(scene) = &args.run.start.scene {
+        let found = poses::dataset_of(scene, args.run.device.threads, &follower, console)?;
+        args.run.start.scene = found.or(args.run.start.scene.take());
+    }
+    let args = &*args;
     let (spec, resumed) = args.describe(matches, &follower)?;
     let occupied = match (args.resume, args.overwrite) {
         (true, _) => Occupied::Resume,

@@ -49,7 +49,7 @@ impl Case {
             .chain(flags.split_whitespace());
         let matches = crate::command().try_get_matches_from(words).unwrap();
         let matches = matches.subcommand_matches("train").unwrap();
-        run(&TrainArgs::from_arg_matches(matches).unwrap(), matches, &Console::new(true))
+        run(&mut TrainArgs::from_arg_matches(matches).unwrap(), matches, &Console::new(true))
     }
 
     /// Trains with a fault; returns the exit code and the message. Fails if the fault never occurred.

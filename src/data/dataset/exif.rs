@@ -28,6 +28,8 @@ pub(super) struct Exif {
     orientation: Option<Orientation>,
     /// The exposure `[stops above 1 s at f/1 and ISO 1]`, or the implausible value; `None` if a field is missing.
     exposure: Option<Result<f64, String>>,
+    /// Make, model and focal length, which photographs by one lens have in common; `None` if one of them is missing.
+    pub(super) lens: Option<String>,
 }
 
 impl Exif {
@@ -43,7 +45,17 @@ impl Exif {
         let fields =
             is_small.then(|| exif::Reader::new().read_from_container(&mut BufReader::new(file)));
         let Some(Ok(fields)) = fields else { return Self::default() };
-        Self { orientation: orientation(&fields), exposure: exposure(&fields) }
+        Self { orientation: orientation(&fields), exposure: exposure(&fields), lens: lens(&fields) }
+    }
+
+    /// Direction in the image, as its pixels are stored (x right, y down), that is up when it is shown upright.
+    pub(super) fn up(&self) -> [f64; 2] {
+        match self.orientation.map_or(1, Orientation::to_exif) {
+            3 | 4 => [0.0, 1.0],
+            5 | 6 => [-1.0, 0.0],
+            7 | 8 => [1.0, 0.0],
+            _ => [0.0, -1.0],
+        }
     }
 
     /// The quarter turn that makes the photograph upright, if it needs one. Other orientations keep width and height.
@@ -55,6 +67,15 @@ impl Exif {
 fn orientation(fields: &exif::Exif) -> Option<Orientation> {
     let number = fields.get_field(Tag::Orientation, In::PRIMARY)?.value.get_uint(0)?;
     Orientation::from_exif(u8::try_from(number).ok()?)
+}
+
+/// As [`Exif::lens`].
+fn lens(fields: &exif::Exif) -> Option<String> {
+    let text = |tag| {
+        let value = fields.get_field(tag, In::PRIMARY)?.display_value().to_string();
+        Some(value).filter(|value| !value.trim_matches(['"', ' ', '0', '.']).is_empty())
+    };
+    Some([text(Tag::Make)?, text(Tag::Model)?, text(Tag::FocalLength)?].join(" "))
 }
 
 /// As [`Exif::exposure`].

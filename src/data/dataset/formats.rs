@@ -6,7 +6,7 @@ use std::path::Path;
 use serde_json::Value;
 
 use super::paths::Root;
-use super::{LoadError, LoadOptions, Note, Scene, colmap, realitycapture, transforms};
+use super::{LoadError, LoadOptions, Note, Photographs, Scene, colmap, realitycapture, transforms};
 use super::{frame_lists, json};
 
 /// A format of datasets in folders.
@@ -45,8 +45,14 @@ pub(super) fn read_scene(root: &Root, options: &LoadOptions) -> Result<Scene, Lo
             return Ok(scene);
         }
     }
+    let has_photographs = Photographs::list(root.path()).is_ok_and(|found| !found.all.is_empty());
+    let remedy = if has_photographs {
+        "find the cameras of its photographs with `densify poses`, or "
+    } else {
+        ""
+    };
     Err(LoadError::Data(format!(
-        "{} is not a dataset: it has neither the files of {}; give a folder or ZIP archive with one of these",
+        "{} is not a dataset: it has neither the files of {}; {remedy}give a folder or ZIP archive with one of these",
         root.path().display(),
         formats()
             .iter()

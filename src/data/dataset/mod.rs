@@ -32,6 +32,7 @@ mod source_file;
 mod tracks;
 mod transforms;
 mod undistort;
+mod unposed;
 mod view_list;
 mod window;
 
@@ -71,6 +72,7 @@ use paths::Root;
 pub use seen_depths::SeenDepths;
 pub(crate) use tracks::MIN_VIEWS;
 pub use tracks::Tracks;
+pub use unposed::{Photograph, Photographs, is_video};
 pub use view_list::view_line;
 pub use window::Part;
 

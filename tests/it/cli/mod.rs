@@ -30,6 +30,8 @@ mod meshing;
 mod model_formats;
 mod neutral_options;
 mod photographing;
+#[cfg(unix)]
+mod posing;
 mod remote;
 mod reporting;
 mod resuming;

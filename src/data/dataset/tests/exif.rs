@@ -22,12 +22,12 @@ fn exposed(((a, b), (c, d), iso): Settings) -> Vec<(Tag, Value)> {
     ]
 }
 
-fn turned(orientation: u16) -> Vec<(Tag, Value)> {
+pub(super) fn turned(orientation: u16) -> Vec<(Tag, Value)> {
     vec![(Tag::Orientation, Value::Short(vec![orientation]))]
 }
 
 /// Writes these fields into a PNG file, after its header.
-fn write_exif(path: &Path, fields: Vec<(Tag, Value)>) {
+pub(super) fn write_exif(path: &Path, fields: Vec<(Tag, Value)>) {
     let field = |(tag, value)| Field { tag, ifd_num: In::PRIMARY, value };
     let fields: Vec<Field> = fields.into_iter().map(field).collect();
     let mut writer = Writer::new();

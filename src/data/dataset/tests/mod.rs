@@ -11,6 +11,7 @@ mod phones;
 mod realitycapture;
 mod shared;
 mod transforms;
+mod unposed;
 
 use std::path::Path;
 
