@@ -40,6 +40,7 @@ Column = Literal[
     "distance_sum",
     "weight_max",
     "dominant_pixels",
+    "weight_in_front",
     "depth",
     "radius",
 ]

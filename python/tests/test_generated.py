@@ -32,6 +32,7 @@ TYPES = {
     "depth_weight": "float | str",
     "depth_term": "str",
     "distortion_weight": "float",
+    "remove_floaters": "bool",
     "init": "StrPath",
     "init_rates": "str",
     "freeze": "StrPath",
