@@ -150,7 +150,8 @@ pub(super) fn dataset_of(
         keep_frame: false,
         overwrite: false,
     };
-    let found = find(&options, follower).map_err(Failure::from)?;
+    let origin = format!("{} is not a dataset, but has photographs", input.display());
+    let found = find(&options, follower).map_err(|error| Failure::from(error).within(&origin))?;
     console.say(format_args!(
         "poses    {} of {} photographs in {shown}",
         found.accepted, found.photographs

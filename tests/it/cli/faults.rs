@@ -61,7 +61,8 @@ fn damaged_datasets_are_refused() {
     scene.truncate("sparse/0/points3D.txt", 12);
     refused(&scene, "", &["points3D.txt", "line 300"]);
     std::fs::remove_dir_all(scene.file("sparse")).expect("the model");
-    refused(&scene, "", &["is not a dataset", "COLMAP"]);
+    // `train` would find the cameras of the photographs.
+    call(&format!("plan {}", text(scene.path()))).refused("plan", &["is not a dataset", "COLMAP"]);
 }
 
 /// The header is valid, so the damage shows only when training decodes the pixels.
