@@ -241,6 +241,7 @@ const MODULES: [(&str, &[&str]); 5] = [
             "metrics",
             "evaluate",
             "importance",
+            "in_front",
             "pictures",
             "schedule",
             "init",

@@ -24,7 +24,7 @@ use densify_train::trainer::AutoChoices;
 
 /// Memory of the program itself `[bytes]`: the code pages in use, and the stacks of its threads. Measured at 15 to 17
 /// MiB, and at up to 20 MiB in builds for tests (profile `dev`): it varies with what the system has mapped already.
-const PROGRAM: u64 = 16 << 20;
+const PROGRAM: u64 = 20 << 20;
 /// If the process takes more than expected, for example because of a driver, its actual memory counts, rounded up to a
 /// multiple of this number so that the ledger does not change from call to call `[bytes]`. Calls of one build differ by
 /// up to 0.7 MiB, builds by up to 5 MiB, from 15 to 20: with a smaller step, more builds would have calls on both sides
