@@ -14,8 +14,8 @@ fn floaters_are_removed_before_the_policy_plans() {
         counts,
         [(1, floaters, 5, 1), (2, floaters, 4, 1), (2, "scripted", 3, 1), (3, floaters, 2, 1),]
     );
-    assert_eq!(trainer.state.extra_forwards, 3 * 4);
-    assert_eq!(log.lock().unwrap().iter().filter(|call| call.starts_with("observe")).count(), 12);
+    assert_eq!(trainer.state.extra_forwards, 3 * 3);
+    assert_eq!(log.lock().unwrap().iter().filter(|call| call.starts_with("observe")).count(), 9);
 }
 
 #[test]
