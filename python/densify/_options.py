@@ -87,6 +87,9 @@ class Options(TypedDict, total=False):
     distortion_weight: float
     """Weight of a term that gathers the Gaussians along each ray, after a third of the run; needs no given depth (default: 0)"""
 
+    remove_floaters: bool
+    """Prune Gaussians with most of their weight in front of the given depth, or else of the model's own median depth, after each of the first three tenths of the run (default: false)"""
+
     budget: int | str
     """Maximum number of Gaussians in the model: 200000, 28k, 1.5M (default: 200k, or as many as --memory holds)"""
 
