@@ -1,9 +1,7 @@
 //! Removes floaters during training: at the first three tenths of the run, Gaussians with most of their weight in front
 //! of the surface are pruned, while the policy still grows others in their place.
 
-use densify_render::AuxInput;
-
-use super::{AtStep, EditEvent, TrainError, Trainer};
+use super::{EditEvent, TrainError, TrainOptions, Trainer};
 use crate::in_front::{self, MARGIN, RowWeights};
 use densify_data::views::ViewSource;
 use densify_policies::policy::AuxRequest;
@@ -32,35 +30,18 @@ fn is_due(step: u32, iterations: u32) -> bool {
 impl<V: ViewSource> Trainer<V> {
     /// Removes floaters after `step`, if it is enabled and due.
     pub(super) fn remove_floaters(&mut self, step: u32) -> Result<Option<EditEvent>, TrainError> {
-        let options = self.options;
-        if !options.removes_floaters || !is_due(step, options.iterations) {
+        let TrainOptions { removes_floaters, iterations, .. } = self.options;
+        if !removes_floaters || !is_due(step, iterations) {
             return Ok(None);
         }
         let request = floater_request();
-        let mut weights = vec![RowWeights::default(); self.backend.rows()];
-        let sh_degree = self.sh_degree(step);
-        for view in self.sample_scored_views(VIEWS, step) {
-            let (image, depth) = self.image_with_depth(step, view)?;
-            let exposure = self.state.exposures.as_ref().map(|exposures| exposures.transform(view));
-            let measured = self.backend.observe(&AuxInput {
-                step,
-                view,
-                seed: options.seed,
-                camera: self.views.camera(view),
-                target: &image,
-                background: options.background.at(options.seed, step),
-                exposure: exposure.as_ref(),
-                sh_degree,
-                depth: depth.as_deref(),
-                request: &request,
-            });
-            in_front::add(&mut weights, &measured.at(step)?);
-            self.state.extra_forwards += 1;
-        }
-        let trained = (0..).zip(&weights[options.frozen..]);
-        let floaters: Vec<u32> =
-            trained.filter(|(_, weights)| weights.is_floater()).map(|(row, _)| row).collect();
         let (rows, _) = self.trained_rows_and_budget();
+        let mut weights = vec![RowWeights::default(); rows];
+        for view in self.sample_scored_views(VIEWS, step) {
+            in_front::add(&mut weights, &self.observe_view(step, view, &request)?);
+        }
+        let floaters = (0..).zip(&weights).filter(|(_, weights)| weights.is_floater());
+        let floaters: Vec<u32> = floaters.map(|(row, _)| row).collect();
         if floaters.len() == rows {
             return Ok(None);
         }

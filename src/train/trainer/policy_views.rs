@@ -3,11 +3,11 @@
 use std::any::Any;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
-use densify_policies::policy::{AuxView, PolicyError};
+use densify_policies::policy::{AuxRequest, AuxView, PolicyError};
 
 use super::{AtStep, TrainError, Trainer};
 use densify_data::views::ViewSource;
-use densify_render::AuxInput;
+use densify_render::{AuxInput, AuxOutput};
 
 impl<V: ViewSource> Trainer<V> {
     /// Renders the auxiliary views for the policy's edit after `step`, one by one.
@@ -17,34 +17,45 @@ impl<V: ViewSource> Trainer<V> {
         let Some(request) = self.needs.aux.clone().filter(|_| count > 0) else {
             return Ok(());
         };
-        let (options, degree, frozen) =
-            (self.options, self.sh_degree(step), self.row_budget().frozen);
         for view in self.sample_scored_views(count, step) {
-            let (image, depth) = self.image_with_depth(step, view)?;
-            let exposure = self.state.exposures.as_ref().map(|exposures| exposures.transform(view));
-            let measured = self.backend.observe(&AuxInput {
-                step,
-                view,
-                seed: options.seed,
-                camera: self.views.camera(view),
-                target: &image,
-                background: options.background.at(options.seed, step),
-                exposure: exposure.as_ref(),
-                sh_degree: degree,
-                depth: depth.as_deref(),
-                request: &request,
-            });
-            let mut measured = measured.at(step)?;
-            for (_, column) in &mut measured.columns {
-                column.drain(..frozen);
-            }
-            self.state.extra_forwards += 1;
+            let measured = self.observe_view(step, view, &request)?;
             let (loss, columns, points) = (measured.loss, &measured.columns, &measured.points);
             let view = AuxView { step, rows, loss, columns, points };
             let observed = call_policy(|| self.policy.observe(&view)).flatten();
             observed.map_err(|source| self.policy_error(step, source))?;
         }
         Ok(())
+    }
+
+    /// Renders a training view after `step` and measures it. Shape of the columns: `[rows that are not frozen]`.
+    pub(super) fn observe_view(
+        &mut self,
+        step: u32,
+        view: usize,
+        request: &AuxRequest,
+    ) -> Result<AuxOutput, TrainError> {
+        let (image, depth) = self.image_with_depth(step, view)?;
+        let exposure = self.state.exposures.as_ref().map(|exposures| exposures.transform(view));
+        let (options, sh_degree) = (self.options, self.sh_degree(step));
+        let measured = self.backend.observe(&AuxInput {
+            step,
+            view,
+            seed: options.seed,
+            camera: self.views.camera(view),
+            target: &image,
+            background: options.background.at(options.seed, step),
+            exposure: exposure.as_ref(),
+            sh_degree,
+            depth: depth.as_deref(),
+            request,
+        });
+        let mut measured = measured.at(step)?;
+        let frozen = self.row_budget().frozen;
+        for (_, column) in &mut measured.columns {
+            column.drain(..frozen);
+        }
+        self.state.extra_forwards += 1;
+        Ok(measured)
     }
 }
 
