@@ -133,6 +133,16 @@ pub struct AuxInput<'a> {
     pub request: &'a AuxRequest,
 }
 
+impl<'a> AuxInput<'a> {
+    /// Measures rows: sums and maxima of blend weights, which depend neither on the colours of the model nor on the
+    /// target, an image of the camera's size.
+    pub fn of_rows(camera: &'a Camera, target: &'a Image8, request: &'a AuxRequest) -> Self {
+        let (step, view, seed, sh_degree) = (0, 0, 0, 0);
+        let (background, exposure, depth) = ([0.0; 3], None, None);
+        Self { step, view, seed, camera, target, background, exposure, sh_degree, depth, request }
+    }
+}
+
 /// The measurements of a view.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct AuxOutput {

@@ -32,19 +32,8 @@ pub(super) fn measure(
     for view in 0..views.count() {
         check_interrupt(observer)?;
         let camera = views.camera(view);
-        let measured = backend.observe(&AuxInput {
-            step: 0,
-            view,
-            seed: 0,
-            camera,
-            // Weights do not depend on the photograph.
-            target: &Image8::black(camera.width, camera.height),
-            background: [0.0; 3],
-            exposure: None,
-            sh_degree: 0,
-            depth: None,
-            request: &request,
-        })?;
+        let black = Image8::black(camera.width, camera.height);
+        let measured = backend.observe(&AuxInput::of_rows(camera, &black, &request))?;
         in_front::add(&mut sums, &measured);
     }
     Ok(sums)

@@ -68,7 +68,7 @@ impl<'a> Pixels<'a> {
         let (world, ray_camera) = scene.cameras(camera);
         let g_buffer = scene.g_buffer(name, &ray_camera)?;
         let failed = |source| EvaluateError::Backend { view: name.to_owned(), source };
-        let weights = weights(backend, scene, camera).map_err(failed)?;
+        let weights = weights(backend, camera).map_err(failed)?;
         let rendering =
             backend.render(camera, scene.background, scene.sh_degree).map_err(failed)?;
         for Shown { weight, depth, pixel } in shown(self.rows, &weights, &world) {

@@ -67,7 +67,7 @@ impl Visibility {
             let name = views.name(number);
             let failed = |source| EvaluateError::Backend { view: name.to_owned(), source };
             let camera = views.camera(number);
-            let weights = visibility.add_weights(backend, scene, camera, &request);
+            let weights = visibility.add_weights(backend, camera, &request);
             let weights = weights.map_err(failed)?;
             let (world, ray_camera) = scene.cameras(camera);
             let g_buffer = scene.g_buffer(name, &ray_camera)?;
@@ -109,12 +109,11 @@ impl Visibility {
     fn add_weights(
         &mut self,
         backend: &mut dyn Backend,
-        scene: &KnownScene<'_>,
         camera: &Camera,
         request: &AuxRequest,
     ) -> Result<Vec<f32>, BackendError> {
         let mut weights = Vec::new();
-        for (column, values) in observed(backend, scene, camera, request)? {
+        for (column, values) in observed(backend, camera, request)? {
             let numbers = values.iter().map(|&value| f64::from(value));
             match column {
                 AuxColumn::WeightSum => {
@@ -164,34 +163,20 @@ impl Visibility {
 /// The requested columns of a view.
 fn observed(
     backend: &mut dyn Backend,
-    scene: &KnownScene<'_>,
     camera: &Camera,
     request: &AuxRequest,
 ) -> Result<Vec<(AuxColumn, Vec<f32>)>, BackendError> {
-    let Camera { width, height, .. } = *camera;
-    let output = backend.observe(&AuxInput {
-        step: 1,
-        view: 0,
-        seed: 0,
-        camera,
-        // Weights do not depend on the target.
-        target: &Image8::black(width, height),
-        background: scene.background,
-        exposure: None,
-        sh_degree: scene.sh_degree,
-        depth: None,
-        request,
-    })?;
+    let black = Image8::black(camera.width, camera.height);
+    let output = backend.observe(&AuxInput::of_rows(camera, &black, request))?;
     Ok(output.columns)
 }
 
 /// The blend weights of one view. Shape: `[rows]`.
 pub(super) fn weights(
     backend: &mut dyn Backend,
-    scene: &KnownScene<'_>,
     camera: &Camera,
 ) -> Result<Vec<f32>, BackendError> {
-    let columns = observed(backend, scene, camera, &needs().aux.unwrap_or_default())?;
+    let columns = observed(backend, camera, &needs().aux.unwrap_or_default())?;
     let sums = columns.into_iter().find(|(column, _)| *column == AuxColumn::WeightSum);
     Ok(sums.map(|(_, sums)| sums).unwrap_or_default())
 }
