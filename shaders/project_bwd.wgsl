@@ -5,12 +5,69 @@
 // Sums of the records, one record per row.
 @group(0) @binding(6) var<storage, read_write> row_sums: array<f32>;
 @group(0) @binding(7) var<storage, read_write> splats: array<f32>;
+// Derivatives with respect to the camera's twist: v and its spare, ω and the logarithm of the focal lengths, of each
+// group of rows; then of all.
+@group(0) @binding(8) var<storage, read_write> pose_sums: array<vec4<f32>>;
+@group(0) @binding(9) var<storage, read_write> pose_total: array<vec4<f32>>;
+
+// The twist of the camera in two columns: v and 0; ω and the logarithm of the focal lengths.
+alias Twist = mat2x4<f32>;
+
+var<workgroup> reduced: array<Twist, GROUP>;
 
 @compute @workgroup_size(256)
 fn project_bwd(@builtin(global_invocation_id) id: vec3<u32>) {
-    let i = index_of(id);
+    differentiate_row(index_of(id));
+}
+
+// The same, and the sum of the derivatives with respect to the camera's twist over the group.
+@compute @workgroup_size(256)
+fn project_bwd_pose(
+    @builtin(global_invocation_id) id: vec3<u32>,
+    @builtin(workgroup_id) group_id: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+) {
+    reduced[lane] = differentiate_row(index_of(id));
+    let sum = reduced_sum(lane);
+    let group = group_of(group_id);
+    if lane == 0u && group * GROUP < frame.model.x {
+        pose_sums[2u * group] = sum[0];
+        pose_sums[2u * group + 1u] = sum[1];
+    }
+}
+
+// The sum over all rows; a single group.
+@compute @workgroup_size(256)
+fn total_pose(@builtin(local_invocation_index) lane: u32) {
+    let groups = (frame.model.x + GROUP - 1u) / GROUP;
+    var sum = Twist();
+    for (var group = lane; group < groups; group += GROUP) {
+        sum += Twist(pose_sums[2u * group], pose_sums[2u * group + 1u]);
+    }
+    reduced[lane] = sum;
+    let all = reduced_sum(lane);
+    if lane == 0u {
+        pose_total[0] = all[0];
+        pose_total[1] = all[1];
+    }
+}
+
+// The sum of `reduced`; valid in the first invocation.
+fn reduced_sum(lane: u32) -> Twist {
+    workgroupBarrier();
+    for (var half = GROUP / 2u; half > 0u; half /= 2u) {
+        if lane < half {
+            reduced[lane] += reduced[lane + half];
+        }
+        workgroupBarrier();
+    }
+    return reduced[0];
+}
+
+// Replaces a row's splat and sums by its gradient, and returns the derivatives with respect to the camera's twist.
+fn differentiate_row(i: u32) -> Twist {
     if i < frame.frozen.x || i >= frame.model.x {
-        return;
+        return Twist();
     }
     let at = i * RECORD;
     let splat = i * SPLAT;
@@ -21,7 +78,7 @@ fn project_bwd(@builtin(global_invocation_id) id: vec3<u32>) {
         for (var k = 0u; k < BASE; k++) {
             row_sums[at + k] = 0.0;
         }
-        return;
+        return Twist();
     }
     let row = load_row(i);
     let g = geometry(row);
@@ -115,6 +172,13 @@ fn project_bwd(@builtin(global_invocation_id) id: vec3<u32>) {
     splats[splat + 6u] = by_w;
     splats[splat + 7u] = by_v.x;
     splats[splat + 8u] = by_v.y;
+
+    let turned = turn.x * g.axis0 + turn.y * g.axis1 + turn.z * g.axis2;
+    let in_camera = mat3x3(r0, r1, r2);
+    let by_translation = dp + from_d * in_camera;
+    let by_rotation = cross(g.p, dp) + turned * in_camera;
+    let by_log_focal = dot(dm, frame.lens.xy * g.ratio) + dot(by_log_scale, vec3(1.0));
+    return Twist(vec4(by_translation, 0.0), vec4(by_rotation, by_log_focal));
 }
 
 // The gradient through the factor of opacities with antialiasing: with respect to log-scales, to rotations about

@@ -33,6 +33,11 @@ pub struct Damage {
     pub shift: [i32; 2],
     /// Standard deviation of a rotation of each camera about its centre `[degrees]`, in `[0, 90]`.
     pub pose_noise: f64,
+    /// Standard deviation of a displacement of each camera along each axis, as a share of the largest distance of a
+    /// training camera from their mean, in `[0, 1]`.
+    pub position_noise: f64,
+    /// Relative error of the focal lengths of all training views, in `[-0.5, 1]`.
+    pub focal_error: f64,
 }
 
 impl Default for Damage {
@@ -47,6 +52,8 @@ impl Default for Damage {
             along_rays: false,
             shift: [0; 2],
             pose_noise: 0.0,
+            position_noise: 0.0,
+            focal_error: 0.0,
         }
     }
 }
@@ -61,6 +68,7 @@ const HOLES: u64 = 0x0068_6f6c_6573;
 const SPARSE: u64 = 0x0073_7061_7273;
 const SCALES: u64 = 0x0073_6361_6c65;
 const POSES: u64 = 0x0070_6f73_6573;
+const POSITIONS: u64 = 0x706f_7369_7469;
 
 impl Damage {
     /// True if nothing is damaged.
@@ -80,6 +88,11 @@ impl Damage {
         within("--depth-sparse", self.sparse, 1.0)?;
         within("--depth-scale-jitter", self.scale_jitter, 2.0)?;
         within("--pose-noise", self.pose_noise, 90.0)?;
+        within("--position-noise", self.position_noise, 1.0)?;
+        if !(-0.5..=1.0).contains(&self.focal_error) {
+            let problem = format!("{} is not between -0.5 and 1", self.focal_error);
+            return Err(Error::option("--focal-error", problem));
+        }
         if !(self.scale > 0.0 && self.scale.is_finite()) {
             return Err(Error::option("--depth-scale", "it must be positive and finite"));
         }
@@ -134,16 +147,26 @@ impl Damage {
         Some(values.get(count).copied().unwrap_or(f64::INFINITY))
     }
 
-    /// The pose that is written for a training view.
-    pub(crate) fn pose(&self, camera: &Camera, seed: u64, view: usize) -> Camera {
-        if self.pose_noise <= 0.0 {
-            return *camera;
-        }
+    /// The camera that is written for a training view; `reach` is the largest distance of a training camera from their
+    /// mean.
+    pub(crate) fn camera(&self, camera: &Camera, seed: u64, view: usize, reach: f64) -> Camera {
+        let mut damaged = *camera;
         let mut draws = Draws::new(seed, &[POSES, view as u64]);
-        let axis =
-            DVec3::new(draws.normal(), draws.normal(), draws.normal()).normalize_or(DVec3::Z);
-        let turn = DMat3::from_axis_angle(axis, (self.pose_noise * draws.normal()).to_radians());
-        Camera { world_from_camera: turn * camera.world_from_camera, ..*camera }
+        let vector = |draws: &mut Draws| DVec3::new(draws.normal(), draws.normal(), draws.normal());
+        if self.pose_noise > 0.0 {
+            let axis = vector(&mut draws).normalize_or(DVec3::Z);
+            let angle = (self.pose_noise * draws.normal()).to_radians();
+            let turn = DMat3::from_axis_angle(axis, angle);
+            damaged.world_from_camera = turn * camera.world_from_camera;
+        }
+        if self.position_noise > 0.0 {
+            let mut draws = Draws::new(seed, &[POSITIONS, view as u64]);
+            damaged.centre += self.position_noise * reach * vector(&mut draws);
+        }
+        for focal in [&mut damaged.fx, &mut damaged.fy] {
+            *focal *= 1.0 + self.focal_error;
+        }
+        damaged
     }
 }
 
@@ -202,7 +225,7 @@ mod tests {
     fn nothing_is_damaged_by_default() {
         assert!(Damage::default().is_none());
         assert_eq!(damaged(Damage::default()), frame().depth);
-        let pose = Damage::default().pose(&camera(), 7, 3);
+        let pose = Damage::default().camera(&camera(), 7, 3, 1.0);
         assert_eq!(pose, camera());
     }
 
@@ -257,11 +280,22 @@ mod tests {
     #[test]
     fn poses_are_turned_about_the_centre() {
         let damage = Damage { pose_noise: 0.2, ..Damage::default() };
-        let turned = damage.pose(&camera(), 7, 3);
+        let turned = damage.camera(&camera(), 7, 3, 1.0);
         assert_eq!(turned.centre, camera().centre);
         let angle = |camera: Camera| camera.world_from_camera.z_axis;
         let angle = angle(turned).angle_between(angle(camera())).to_degrees();
         assert!(angle > 1e-4 && angle < 1.5, "{angle}");
+    }
+
+    #[test]
+    fn positions_and_focal_lengths_are_changed() {
+        let damage = Damage { position_noise: 0.01, focal_error: 0.02, ..Damage::default() };
+        let moved = [3, 4].map(|view| damage.camera(&camera(), 7, view, 5.0));
+        let apart = moved.map(|moved| moved.centre.distance(camera().centre));
+        assert!(apart.iter().all(|apart| (1e-3..0.3).contains(apart)), "{apart:?}");
+        assert!((apart[0] - apart[1]).abs() > 1e-6);
+        assert_eq!(moved[0].world_from_camera, camera().world_from_camera);
+        assert!((moved[0].fx / camera().fx - 1.02).abs() < 1e-12);
     }
 
     #[test]
@@ -274,6 +308,8 @@ mod tests {
             (Damage { scale: 0.0, ..none }, "--depth-scale"),
             (Damage { shift: [1 << 20, 0], ..none }, "--depth-shift"),
             (Damage { pose_noise: 91.0, ..none }, "--pose-noise"),
+            (Damage { position_noise: -1.0, ..none }, "--position-noise"),
+            (Damage { focal_error: 2.0, ..none }, "--focal-error"),
         ] {
             let message = damage.check().unwrap_err().to_string();
             assert!(message.contains(option), "{message}");

@@ -5,6 +5,7 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
 use crate::camera::Camera;
@@ -306,9 +307,20 @@ impl Scene {
     pub(crate) fn written_camera(&self, view: usize) -> Camera {
         let View { split, camera, .. } = &self.views[view];
         match split {
-            Split::Train => self.options.damage.pose(camera, self.options.seed, view),
+            Split::Train => {
+                let Options { damage, seed, .. } = &self.options;
+                damage.camera(camera, *seed, view, self.reach())
+            }
             Split::Test => *camera,
         }
+    }
+
+    /// The largest distance of a training camera from their mean.
+    fn reach(&self) -> f64 {
+        let train = self.views.iter().filter(|view| view.split == Split::Train);
+        let centres: Vec<_> = train.map(|view| view.camera.centre).collect();
+        let mean = centres.iter().sum::<DVec3>() / centres.len().max(1) as f64;
+        centres.iter().map(|centre| centre.distance(mean)).fold(0.0, f64::max)
     }
 
     /// The depth that is written for trainers: that of the image, or with the [errors](Options::damage) of a sensor.

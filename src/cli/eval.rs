@@ -113,7 +113,7 @@ pub(super) fn run(args: &EvalArgs, matches: &ArgMatches, console: &Console) -> R
     let (backend, degree) = (opened.backend.as_mut(), opened.sh_degree);
     let has_exposures = run.as_ref().is_some_and(|(config, _)| config.resolved.has_exposures);
     let fits_exposure = args.fit_exposure || has_exposures;
-    let comparison = Comparison { lpips: lpips.as_ref(), fits_exposure };
+    let comparison = Comparison { lpips: lpips.as_ref(), fits_exposure, fits_pose: false };
     let mut check = CoordinateCheck::new(views.count());
     let scores = evaluate(backend, &views, background, degree, comparison, |evaluated| {
         let Evaluated { view, score, rendering, image } = evaluated;

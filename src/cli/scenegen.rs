@@ -147,6 +147,19 @@ pub(super) struct ScenegenArgs {
     /// Rotate the pose of each training view about the camera's centre: the standard deviation of the angle
     #[arg(long, value_name = "DEGREES", help_heading = "Damage", default_value_t = 0.0)]
     pose_noise: f64,
+    /// Displace each training camera along each axis: the standard deviation, as a share of the largest distance of a
+    /// training camera from their mean
+    #[arg(long, value_name = "SHARE", help_heading = "Damage", default_value_t = 0.0)]
+    position_noise: f64,
+    /// Multiply the focal lengths of the training views by 1 + SHARE
+    #[arg(
+        long,
+        value_name = "SHARE",
+        help_heading = "Damage",
+        default_value_t = 0.0,
+        allow_hyphen_values = true
+    )]
+    focal_error: f64,
 
     /// Seed of all random choices
     #[arg(long, value_name = "N", default_value_t = 0)]
@@ -243,6 +256,8 @@ impl ScenegenArgs {
                 along_rays: self.depth_along_rays,
                 shift: self.depth_shift.into(),
                 pose_noise: self.pose_noise,
+                position_noise: self.position_noise,
+                focal_error: self.focal_error,
             },
             points: PointOptions {
                 count: self.points,

@@ -41,6 +41,7 @@ use densify_core::gaussians::{Gaussians, ModelArray};
 use densify_core::image::Image8;
 use densify_core::image::depth::DepthMap;
 use densify_core::memory::Ledger;
+use densify_core::pose::PoseGradient;
 pub use densify_shaders::Accumulation;
 pub use depth::{DepthTarget, DepthTerm};
 pub use differentiable::{Differentiable, ImageGradient};
@@ -88,6 +89,8 @@ pub struct StepInput<'a> {
     /// The exposure of the photograph; requires a backend [set up](Setup::exposures) for exposures. The loss compares
     /// the photograph with the rendering after this transform, which keeps the background unchanged.
     pub exposure: Option<&'a ColourTransform>,
+    /// True to differentiate with respect to the camera's pose; requires a backend [set up](Setup::poses) for it.
+    pub pose: bool,
     /// Given depth of the view; requires a backend [set up](Setup::depth) for depth.
     pub depth: Option<DepthTarget<'a>>,
     /// Weight λ of the distortion term, λ/N·Σ w·(x/X − 1)² over pixels and Gaussians, where x is a Gaussian's inverse
@@ -171,6 +174,9 @@ pub struct StepOutput {
     pub bands: u32,
     /// Gradient of the loss with respect to the exposure, if there is one.
     pub exposure: Option<ColourGradient>,
+    /// Gradient of the loss with respect to the camera's pose and focal length, through the rows that are not frozen,
+    /// if it was requested.
+    pub pose: Option<PoseGradient>,
     /// The [depth term](DepthTerm) without its weight, if depth is given.
     pub depth: Option<f32>,
 }
@@ -233,6 +239,16 @@ pub trait Backend: Send {
     /// # Errors
     /// See [`BackendError`].
     fn train_step(&mut self, input: &StepInput<'_>) -> Result<StepOutput, BackendError>;
+
+    /// Runs a forward and a backward pass and differentiates with respect to the camera's pose; requires a backend
+    /// [set up](Setup::poses) for it. Model, optimiser and signals are unchanged.
+    ///
+    /// # Errors
+    /// See [`BackendError`]; [`BackendError::Unsupported`] if the backend has no such derivatives.
+    fn differentiate_pose(&mut self, input: &StepInput<'_>) -> Result<StepOutput, BackendError> {
+        let _ = input;
+        Err(BackendError::Unsupported("derivatives with respect to poses"))
+    }
 
     /// Renders a view and takes the requested measurements. Model, optimiser and signals are unchanged.
     ///

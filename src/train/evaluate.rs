@@ -7,6 +7,7 @@ use serde::{Deserialize, Deserializer, Serialize};
 use crate::exposure::fitted;
 pub use crate::metrics::EvaluateError;
 use crate::metrics::{Lpips, MetricError, flip, psnr, ssim};
+use crate::poses::fitted_camera;
 use densify_core::image::Image8;
 use densify_data::views::ViewSource;
 use densify_render::{Backend, Rendering};
@@ -34,7 +35,8 @@ pub struct ViewScore {
     pub flip: f64,
     /// LPIPS; `None` if its weights are not available.
     pub lpips: Option<f64>,
-    /// Scores of the rendering with the exposure that fits the photograph best, if requested.
+    /// Scores of the rendering with the pose and the exposure that fit the photograph best, of which each may be
+    /// requested.
     pub fitted: Option<FittedScore>,
 }
 
@@ -53,13 +55,13 @@ pub struct Mean {
     /// LPIPS: distance between network features, 0 for equal images; `None` if its weights were not available.
     #[serde(rename = "LPIPS", default, skip_serializing_if = "Option::is_none")]
     pub lpips: Option<f64>,
-    /// Mean scores of the renderings with the exposures that fit the photographs best, if requested.
+    /// Mean scores of the renderings with the poses and exposures that fit the photographs best, if requested.
     #[serde(flatten)]
     pub fitted: Option<FittedScore>,
 }
 
-/// Scores of a rendering, or means of several. In [`ViewScore`] and [`Mean`] they are measured after fitting a factor
-/// and an offset per channel to the photograph; [`Comparison::score`] returns them without a fit.
+/// Scores of a rendering, or means of several. In [`ViewScore`] and [`Mean`] they are measured after fitting to the
+/// photograph the pose, or a factor and an offset per channel, or both; [`Comparison::score`] returns them without a fit.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct FittedScore {
     /// Peak signal-to-noise ratio `[dB]`.
@@ -117,6 +119,9 @@ pub struct Comparison<'a> {
     pub lpips: Option<&'a Lpips>,
     /// True if renderings are compared a second time, with the exposure that fits the photograph best.
     pub fits_exposure: bool,
+    /// True if renderings are compared a second time, from the pose that fits the photograph best; requires a backend
+    /// [set up](densify_render::Setup::poses) for poses.
+    pub fits_pose: bool,
 }
 
 impl Comparison<'_> {
@@ -179,11 +184,17 @@ pub fn evaluate(
         let metric = |e: MetricError| EvaluateError::View { view: name(), source: e.into() };
         let score = |rendered: &[f32]| comparison.score(rendered, &image, background);
         let FittedScore { psnr, ssim, flip, lpips } = score(&rendering.rgb).map_err(metric)?;
-        let fitted = if comparison.fits_exposure {
-            Some(score(&fitted(&rendering.rgb, &image, background)).map_err(metric)?)
-        } else {
-            None
-        };
+        let mut best = None;
+        if comparison.fits_pose {
+            let device = |source| EvaluateError::Backend { view: name(), source };
+            let camera = fitted_camera(backend, views.camera(view), &image, background, sh_degree);
+            let rendering = backend.render(&camera.map_err(device)?, background, sh_degree);
+            best = Some(rendering.map_err(device)?.rgb);
+        }
+        if comparison.fits_exposure {
+            best = Some(fitted(best.as_ref().unwrap_or(&rendering.rgb), &image, background));
+        }
+        let fitted = best.as_deref().map(score).transpose().map_err(metric)?;
         let score = ViewScore { name: name(), psnr, ssim, flip, lpips, fitted };
         let flow =
             after_view(Evaluated { view, score: &score, rendering: &rendering, image: &image });

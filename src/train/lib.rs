@@ -10,5 +10,6 @@ pub mod init;
 pub mod metrics;
 pub mod output;
 pub mod pictures;
+pub mod poses;
 pub mod schedule;
 pub mod trainer;

@@ -31,7 +31,7 @@ pub(super) fn write(scene: &Scene, root: &Path, points: &InitPoints) -> Result<(
         }
     }
     for (number, view) in scene.views.iter().enumerate() {
-        let (id, c) = (number + 1, &view.camera);
+        let (id, c) = (number + 1, scene.written_camera(number));
         let (model, rest) = model(c.lens.as_ref());
         // Writing to a String does not fail.
         let _ = writeln!(
@@ -40,7 +40,7 @@ pub(super) fn write(scene: &Scene, root: &Path, points: &InitPoints) -> Result<(
             c.width, c.height, c.fx, c.fy, c.cx, c.cy
         );
         // Features are where the image shows them, whatever the pose says.
-        let rotation = scene.written_camera(number).world_from_camera.transpose();
+        let rotation = c.world_from_camera.transpose();
         let q = DQuat::from_mat3(&rotation).normalize();
         let t = -(rotation * c.centre);
         let _ = writeln!(
@@ -49,7 +49,7 @@ pub(super) fn write(scene: &Scene, root: &Path, points: &InitPoints) -> Result<(
             q.w, q.x, q.y, q.z, t.x, t.y, t.z, view.name
         );
         let observations = seen[number].iter().map(|&point| {
-            let (pixel, _) = c.project(points.found_at[point]);
+            let (pixel, _) = view.camera.project(points.found_at[point]);
             format!("{} {} {}", pixel.x, pixel.y, point + 1)
         });
         images += &observations.collect::<Vec<_>>().join(" ");

@@ -32,7 +32,7 @@ fn synthetic(scene: &Scene, first: &Value, split: Split) -> Value {
     let frame = |(number, view): (usize, &View)| {
         let pose = scene.written_camera(number);
         let mut frame = frame_with_pose(&pose, format!("./images/{}", view.name));
-        extend(&mut frame, &intrinsics(scene, &view.camera), |key, value| first[key] != *value);
+        extend(&mut frame, &intrinsics(scene, &pose), |key, value| first[key] != *value);
         frame
     };
     let views = scene.views.iter().enumerate().filter(|(_, view)| view.split == split);
@@ -45,12 +45,14 @@ fn synthetic(scene: &Scene, first: &Value, split: Split) -> Value {
 /// All views. nerfstudio applies intrinsics at the top to all views, so they are written there only if all views
 /// share them.
 fn nerfstudio(scene: &Scene, first: &Value) -> Value {
-    let shared = scene.views.iter().all(|view| intrinsics(scene, &view.camera) == *first);
+    let shared =
+        (0..scene.views.len()).all(|view| intrinsics(scene, &scene.written_camera(view)) == *first);
     let image = |view: &View| format!("images/{}.png", view.name);
     let frame = |(number, view): (usize, &View)| {
-        let mut frame = frame_with_pose(&scene.written_camera(number), image(view));
+        let camera = scene.written_camera(number);
+        let mut frame = frame_with_pose(&camera, image(view));
         frame["depth_file_path"] = json!(format!("depth/{}.npy", view.name));
-        extend(&mut frame, &intrinsics(scene, &view.camera), |_, _| !shared);
+        extend(&mut frame, &intrinsics(scene, &camera), |_, _| !shared);
         if scene.options.passers_by > 0.0 {
             frame["mask_path"] = json!(mask_path(&view.name));
         }

@@ -67,6 +67,8 @@ use images::ImageHeader;
 use lens::Lens;
 use mask_files::MaskFile;
 use normalise::Normalisation;
+pub use normalise::EXTENT;
+pub(crate) use normalise::median;
 pub use options::{FarCameras, LoadOptions, MaskMode, Resolution, Split};
 use paths::Root;
 pub use seen_depths::SeenDepths;

@@ -216,8 +216,8 @@ impl CpuBackend {
         self.threads.recorded()
     }
 
-    /// Runs a training step on a thread of the pool.
-    fn step(&mut self, input: &StepInput<'_>) -> Result<StepOutput, BackendError> {
+    /// Runs a training step on a thread of the pool; unless it `trains`, only the pose is differentiated.
+    fn step(&mut self, input: &StepInput<'_>, trains: bool) -> Result<StepOutput, BackendError> {
         let StepInput { camera, target, background, exposure, .. } = *input;
         let unexposed = exposure.map_or(background, |exposure| exposure.behind(background));
         let (depth, plane) = self.depth_loss(input);
@@ -225,7 +225,7 @@ impl CpuBackend {
         if let Some(exposure) = exposure {
             self.expose(&frame.grid, exposure);
         }
-        let picks = self.candidates.due(input.step, self.rows);
+        let picks = trains.then(|| self.candidates.due(input.step, self.rows)).flatten();
         let weights = picks.and_then(|(request, _)| error_weights(request.error));
         let for_rows = self.signals.layout().has(Field::Error).then_some(self.signals.planes.score);
         let errors = ErrorRequests { for_candidates: weights, for_rows };
@@ -237,13 +237,18 @@ impl CpuBackend {
             self.collect_candidates(&frame, photograph, &request, count);
         }
         let (layout, depth) = self.backward_with_depth(&frame, depth);
-        self.optimise(&frame, input, layout);
+        let pose = if trains {
+            self.optimise(&frame, input, layout)
+        } else {
+            Some(self.pose_gradient(&frame, layout))
+        };
         self.clock.lap("project_bwd + adam");
         Ok(StepOutput {
             visible: frame.visible,
             entries: frame.entries,
             bands: frame.bands.len() as u32,
             exposure: exposure_gradient,
+            pose,
             depth,
             ..scalars(value)
         })
@@ -278,7 +283,13 @@ impl Backend for CpuBackend {
     fn train_step(&mut self, input: &StepInput<'_>) -> Result<StepOutput, BackendError> {
         assert_same_size(input.camera, input.target);
         let threads = Arc::clone(&self.threads);
-        threads.step(|| self.step(input))
+        threads.step(|| self.step(input, true))
+    }
+
+    fn differentiate_pose(&mut self, input: &StepInput<'_>) -> Result<StepOutput, BackendError> {
+        assert_same_size(input.camera, input.target);
+        let threads = Arc::clone(&self.threads);
+        threads.step(|| self.step(input, false))
     }
 
     fn observe(&mut self, input: &AuxInput<'_>) -> Result<AuxOutput, BackendError> {

@@ -22,6 +22,7 @@ use super::summed::{Stepping, TaskSums};
 use crate::LearningRates;
 use crate::signals::{Field, RecordLayout, SignalPlanes};
 use densify_core::gaussians::sh_coefficients;
+use densify_core::pose::TWIST_VALUES;
 
 /// Tolerance of a quaternion's squared length if parameters are stored in fewer bits. If quaternions were normalised
 /// and rounded at each step, even a row without a gradient would rotate randomly.
@@ -64,10 +65,11 @@ pub(super) struct Optimise<'a> {
 }
 
 impl WithSimd for Optimise<'_> {
-    type Output = ();
+    /// The sum of dL/d(twist of the camera) over these rows; 0 if the view does not ask for it.
+    type Output = [f64; TWIST_VALUES];
 
     #[inline(always)]
-    fn with_simd<S: Simd>(self, s: S) {
+    fn with_simd<S: Simd>(self, s: S) -> Self::Output {
         let Self { params: mut stored, mut moments, ages, signals, sums, .. } = self;
         let Self { layout, visible, view, rates, bias, due, terms, noise, .. } = self;
         let Self { mut masks, mut summed, planes: signal_planes, .. } = self;
@@ -80,6 +82,7 @@ impl WithSimd for Optimise<'_> {
         let mut scratch = Scratch::ZERO;
         let mut moment_scratch = [Scratch::ZERO; 2];
         let mut kept = Scratch::ZERO;
+        let mut twist = [0.0; TWIST_VALUES];
         for (b, &seen) in visible.iter().enumerate() {
             let frozen = self.frozen.saturating_sub(b * WIDTH).min(WIDTH);
             if frozen == WIDTH {
@@ -96,6 +99,9 @@ impl WithSimd for Optimise<'_> {
             if seen != 0 || !was_zero {
                 gradient.compute(s, params, sums, layout, seen, view);
                 was_zero = seen == 0;
+            }
+            if view.differentiates_pose && seen != 0 {
+                gradient.add_twist(&mut twist);
             }
             if seen != 0 && signal_stride > 0 {
                 let block = &mut signals[b * signal_stride..(b + 1) * signal_stride];
@@ -161,6 +167,38 @@ impl WithSimd for Optimise<'_> {
                 moments.close(b, trained, &moment_scratch, [&mut m_draws, &mut v_draws]);
             }
         }
+        twist
+    }
+}
+
+/// Differentiates consecutive blocks with respect to the pose, without a step.
+pub(super) struct DifferentiatePose<'a> {
+    pub(super) params: ParameterView<'a>,
+    /// Shape: `[rows, layout.stride()]`.
+    pub(super) sums: &'a [f32],
+    pub(super) layout: RecordLayout,
+    /// Shape: `[blocks]`.
+    pub(super) visible: &'a [u16],
+    pub(super) view: &'a ViewParams,
+}
+
+impl WithSimd for DifferentiatePose<'_> {
+    type Output = [f64; TWIST_VALUES];
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, s: S) -> Self::Output {
+        let Self { params, sums, layout, visible, view } = self;
+        let per_block = WIDTH * layout.stride();
+        let (mut gradient, mut scratch) = (BlockGradient::ZERO, Scratch::ZERO);
+        let mut twist = [0.0; TWIST_VALUES];
+        for (b, (&seen, sums)) in visible.iter().zip(sums.chunks_exact(per_block)).enumerate() {
+            if seen != 0 {
+                let block = params.open(b, planes(view.sh_degree), &mut scratch);
+                gradient.compute(s, block, sums, layout, seen, view);
+                gradient.add_twist(&mut twist);
+            }
+        }
+        twist
     }
 }
 

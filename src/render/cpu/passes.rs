@@ -14,7 +14,7 @@ use super::candidates;
 use super::depth_channel::DepthChannel;
 use super::depth_gradient::GivenTile;
 use super::loss::{ErrorRequests, LossValue};
-use super::optimise::Optimise;
+use super::optimise::{DifferentiatePose, Optimise};
 use super::project::{Project, ViewParams};
 use super::rasterize::{
     Blending, CANVAS_PLANES, DEPTH, DepthPlane, Rasterize, TRANSMITTANCE, TileCanvas, TilePlace,
@@ -31,6 +31,7 @@ use crate::signals::RecordLayout;
 use crate::{BackendError, Rendering, StepInput, StepOutput};
 use densify_core::camera::Camera;
 use densify_core::image::Image8;
+use densify_core::pose::{PoseGradient, TWIST_VALUES};
 
 /// A view between its forward and its backward pass.
 pub(super) struct Frame {
@@ -340,8 +341,14 @@ impl CpuBackend {
         out
     }
 
-    /// Stages 6–8 in one pass over the rows, so that gradients stay in the cache.
-    pub(super) fn optimise(&mut self, frame: &Frame, input: &StepInput<'_>, layout: RecordLayout) {
+    /// Stages 6–8 in one pass over the rows, so that gradients stay in the cache. Returns the gradient with respect to
+    /// the pose, if the step asks for it.
+    pub(super) fn optimise(
+        &mut self,
+        frame: &Frame,
+        input: &StepInput<'_>,
+        layout: RecordLayout,
+    ) -> Option<PoseGradient> {
         let Self {
             threads, arch, params, moments, masks, ages, signals, sums, visible, bias, ..
         } = self;
@@ -370,39 +377,68 @@ impl CpuBackend {
             visible[blocks].par_chunks(BLOCKS_PER_TASK),
             self.summed.tasks(rows, tasks).enumerate(),
         );
-        threads.install(|| {
-            threads.each(
-                "project_bwd + adam",
-                parts,
-                |(params, moments, masks, ages, signals, sums, visible, (task, summed))| {
-                    let first_row = first_row + task * ROWS_PER_TASK;
-                    arch.dispatch(Optimise {
-                        params,
-                        moments,
-                        masks,
-                        rounding_rng: &rounding_rng,
-                        ages,
-                        signals,
-                        planes,
-                        dominant,
-                        sums,
-                        layout,
-                        visible,
-                        view: &frame.view,
-                        rates: &input.rates,
-                        bias,
-                        summed,
-                        due,
-                        terms,
-                        noise,
-                        first_row,
-                        frozen: frozen.saturating_sub(first_row),
-                        rows: rows - first_row,
-                    });
-                },
-            );
-        });
+        let name = "project_bwd + adam";
+        let view = ViewParams { differentiates_pose: input.pose, ..frame.view };
+        let run = |(params, moments, masks, ages, signals, sums, visible, (task, summed))| {
+            let first_row = first_row + task * ROWS_PER_TASK;
+            arch.dispatch(Optimise {
+                params,
+                moments,
+                masks,
+                rounding_rng: &rounding_rng,
+                ages,
+                signals,
+                planes,
+                dominant,
+                sums,
+                layout,
+                visible,
+                view: &view,
+                rates: &input.rates,
+                bias,
+                summed,
+                due,
+                terms,
+                noise,
+                first_row,
+                frozen: frozen.saturating_sub(first_row),
+                rows: rows - first_row,
+            })
+        };
+        if !input.pose {
+            threads.install(|| threads.each(name, parts, |part| _ = run(part)));
+            return None;
+        }
+        Some(total_twist(threads.install(|| threads.collect(name, parts, run))))
     }
+
+    /// The gradient with respect to the pose, without a step.
+    pub(super) fn pose_gradient(&mut self, frame: &Frame, layout: RecordLayout) -> PoseGradient {
+        let Self { threads, arch, params, sums, visible, rows, .. } = self;
+        let view = ViewParams { differentiates_pose: true, ..frame.view };
+        let params = params.view(*rows);
+        let parts = (
+            visible[..rows.div_ceil(WIDTH)].par_chunks(BLOCKS_PER_TASK),
+            sums.par_chunks(ROWS_PER_TASK * layout.stride()),
+        );
+        let run = |(task, (visible, sums))| {
+            let params = params.task(task);
+            arch.dispatch(DifferentiatePose { params, sums, layout, visible, view: &view })
+        };
+        let parts = parts.into_par_iter().enumerate();
+        total_twist(threads.install(|| threads.collect("project_bwd", parts, run)))
+    }
+}
+
+/// The sum of the derivatives of all tasks, in order.
+fn total_twist(parts: Vec<[f64; TWIST_VALUES]>) -> PoseGradient {
+    let mut total = [0.0; TWIST_VALUES];
+    for part in parts {
+        for (total, part) in total.iter_mut().zip(part) {
+            *total += part;
+        }
+    }
+    PoseGradient::from_array(total)
 }
 
 /// Calls `f(patch, lane, pixel of the image)` for every pixel of a tile inside the image.

@@ -56,6 +56,8 @@ pub(crate) struct ViewParams {
     pub(crate) blur: f32,
     /// True if the blur lowers opacities.
     pub(crate) lowers_opacity: bool,
+    /// True if the backward pass differentiates with respect to the pose.
+    pub(crate) differentiates_pose: bool,
 }
 
 impl ViewParams {
@@ -83,6 +85,7 @@ impl ViewParams {
             sh_degree,
             blur: antialiasing.kernel(),
             lowers_opacity: antialiasing.is_on(),
+            differentiates_pose: false,
         }
     }
 }

@@ -18,6 +18,14 @@
 //! - dL/dV = q·(1 − ρ²)·[v₁ × n; n × v₀]/|n|² − q·κ·V/det Σ,
 //! - Vᵀ·S⁻¹·V = I − n̂·n̂ᵀ in the frame of the Gaussian's axes, for log-scales and rotations.
 
+//! The camera's pose moves by a twist (v, ω), p ← p + v + ω × p. Moving it by v is moving the mean by Wᵀ·v, and turning
+//! it by ω is turning p and the Gaussian's axes, but not the direction from which its colour is seen. With dL/dp as it is
+//! before the colour's share, rᵢ = dL/d(rotation about axis i), and dL/d(mean):
+//! - dL/dv = W·dL/d(mean), dL/dω = p × dL/dp + W·Σ rᵢ·axisᵢ,
+//! - dL/d(log f) = dL/d(projected mean)·(projected mean − principal point) + Σ dL/d(log sₖ), as V is proportional to f
+//!   (where x/z is clamped, its bounds are held fixed).
+
+use densify_core::pose::TWIST_VALUES;
 use pulp::Simd;
 
 use super::blocks::plane;
@@ -47,6 +55,8 @@ pub(super) struct BlockGradient {
     pub(super) visible: [f32; WIDTH],
     /// Number of pixels in which the row has the largest blend weight, if they are counted.
     pub(super) dominant: [f32; WIDTH],
+    /// dL/d(twist of the camera), if the view asks for it.
+    pub(super) twist: [[f32; WIDTH]; TWIST_VALUES],
 }
 
 impl BlockGradient {
@@ -58,7 +68,15 @@ impl BlockGradient {
         sums: [[0.0; WIDTH]; RecordLayout::MOST],
         visible: [0.0; WIDTH],
         dominant: [0.0; WIDTH],
+        twist: [[0.0; WIDTH]; TWIST_VALUES],
     };
+
+    /// Adds the derivatives with respect to the camera's twist, which have been computed.
+    pub(super) fn add_twist(&self, sums: &mut [f64; TWIST_VALUES]) {
+        for (sum, lanes) in sums.iter_mut().zip(&self.twist) {
+            *sum += lanes.iter().map(|&x| f64::from(x)).sum::<f64>();
+        }
+    }
 
     /// Differentiates the rows of `block` that are set in `visible`; other rows get 0.
     ///
@@ -206,10 +224,24 @@ impl BlockGradient {
         }
         let by_dir = sh::basis_gradient(degree, dir, &weights, zero);
         let radial = dot(by_dir, dir);
+        let from_dir = each!(i in 3 => (by_dir[i] - radial * dir[i]) * inv_distance);
         for i in 0..3 {
             let from_p = rot[0][i] * dp[0] + rot[1][i] * dp[1] + rot[2][i] * dp[2];
-            let from_dir = (by_dir[i] - radial * dir[i]) * inv_distance;
-            put!(plane::MEAN + i, from_p + from_dir);
+            put!(plane::MEAN + i, from_p + from_dir[i]);
+        }
+        if view.differentiates_pose {
+            let turned = each!(i in 3 => turn[0] * a0[i] + turn[1] * a1[i] + turn[2] * a2[i]);
+            let p = g.p;
+            let by_log_focal = (0..2).fold(zero, |sum, i| sum + dm[i] * focal[i] * ratio[i]);
+            let by_log_focal = by_log_focal + by_log_scale[0] + by_log_scale[1] + by_log_scale[2];
+            for i in 0..3 {
+                let (j, k) = ((i + 1) % 3, (i + 2) % 3);
+                let by_translation = dp[i] + dot(rot[i], from_dir);
+                let by_rotation = p[j] * dp[k] - p[k] * dp[j] + dot(rot[i], turned);
+                seen.keep(by_translation).store(&mut self.twist[i][at..]);
+                seen.keep(by_rotation).store(&mut self.twist[3 + i][at..]);
+            }
+            seen.keep(by_log_focal).store(&mut self.twist[6][at..]);
         }
 
         // dα/d(logit) = α(1 − o); 1 − o = σ(−logit) keeps its precision near o = 1.

@@ -86,7 +86,7 @@ impl Differentiable for GpuBackend {
         self.run(&frame, |passes, to| {
             passes.forward(to);
             passes.backward(to);
-            passes.differentiate(to);
+            passes.differentiate(to, false);
         })?;
         let rendering = self.rendering(camera.width, camera.height, false)?;
         Ok((rendering, self.model_gradient(&frame)?))

@@ -42,6 +42,7 @@ pub(super) fn sizes(device: &Device, sh_degree: u8, options: &Setup) -> Sizes {
     let mut sizes = Sizes::new(budget, cap, sh_degree, image, needs, depth, device.accumulation);
     sizes.photographs = options.photographs;
     sizes.exposures = options.exposures;
+    sizes.poses = options.poses;
     sizes.storage = options.storage;
     // The photographs are in one buffer, which no kernel binds.
     let bytes = sizes.photograph_bytes().iter().sum::<u64>();

@@ -26,6 +26,7 @@ mod memory_plan;
 mod observe;
 mod passes;
 mod pipelines;
+mod pose;
 mod readback;
 mod rows;
 mod sizes;
@@ -109,6 +110,8 @@ pub struct GpuBackend {
     photographs: HashMap<usize, ResidentPhotograph>,
     /// Derivative sums of the last step's exposure, if it had one; see `shaders/exposure.wgsl`.
     exposure_sums: [[f32; 4]; 4],
+    /// Sums of the last step's gradient with respect to the pose, if it had one.
+    pose_sums: [[f32; 4]; 2],
     /// Number of bands to encode for the next view.
     bands: u32,
     stage_times: Vec<(&'static str, Duration)>,
@@ -158,6 +161,7 @@ impl GpuBackend {
             candidates: Candidates::new(options.needs.candidates),
             photographs: HashMap::new(),
             exposure_sums: [[0.0; 4]; 4],
+            pose_sums: [[0.0; 4]; 2],
             bands: 1,
             stage_times: Vec::new(),
         };
@@ -264,7 +268,11 @@ impl Backend for GpuBackend {
     }
 
     fn train_step(&mut self, input: &StepInput<'_>) -> Result<StepOutput, BackendError> {
-        self.step(input)
+        self.step(input, true)
+    }
+
+    fn differentiate_pose(&mut self, input: &StepInput<'_>) -> Result<StepOutput, BackendError> {
+        self.step(&StepInput { pose: true, ..*input }, false)
     }
 
     fn observe(&mut self, input: &AuxInput<'_>) -> Result<AuxOutput, BackendError> {

@@ -286,10 +286,15 @@ impl<L> Passes<'_, L> {
     }
 
     /// Stage 6.
-    pub(super) fn differentiate(&self, to: &mut impl Record<L>) {
+    pub(super) fn differentiate(&self, to: &mut impl Record<L>, with_pose: bool) {
+        let l = self.launches;
         to.stage("project_bwd");
-        let launch = self.launches.get("project_bwd");
-        to.run_counted(launch, [0; 4], args::STEP);
+        if with_pose {
+            to.run_counted(l.get("project_bwd_pose"), [0; 4], args::STEP);
+            to.run(l.get("total_pose"), [0; 4], 1);
+        } else {
+            to.run_counted(l.get("project_bwd"), [0; 4], args::STEP);
+        }
     }
 
     /// Stages 6 to 8. Colours step before the geometry, as their gradient depends on it. The weight in `mask` is
@@ -298,11 +303,11 @@ impl<L> Passes<'_, L> {
         &self,
         to: &mut impl Record<L>,
         sh_degree: u8,
-        signals: bool,
+        [with_pose, signals]: [bool; 2],
         mask: Option<MaskTerm>,
     ) {
         let l = self.launches;
-        self.differentiate(to);
+        self.differentiate(to, with_pose);
         if signals {
             to.run_counted(l.get("accumulate"), [0; 4], args::STEP);
         }

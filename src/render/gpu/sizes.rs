@@ -3,9 +3,9 @@
 use densify_policies::policy::{Cadence, ErrorMode, Needs, PixelLoss};
 use wgpu::BufferUsages;
 
-use super::exposure;
 use super::frame::{Frame, State, grid};
 use super::rows::{Content, Narrow, RowArray, row_arrays};
+use super::{exposure, pose};
 use crate::Accumulation;
 use crate::cpu::BiasCorrection;
 use crate::signals::{Field, RecordLayout, SignalPlanes, counts_dominant};
@@ -76,6 +76,8 @@ pub(super) struct Sizes {
     pub(super) with_edges: bool,
     /// True if photographs have exposures.
     pub(super) exposures: bool,
+    /// True if steps may differentiate the pose.
+    pub(super) poses: bool,
     /// True if depth may be in the loss.
     pub(super) depth: bool,
 }
@@ -137,6 +139,7 @@ impl Sizes {
             with_error: records.has(Field::Error)
                 && needs.candidates.is_some_and(|r| r.error != ErrorMode::Gradient),
             exposures: false,
+            poses: false,
             depth,
         }
     }
@@ -290,6 +293,11 @@ impl Sizes {
             let sums = exposure::SUMS * exposure::groups(pixels);
             add(Section::Renderer, "exposure", "exposure sums", sums);
             add(Section::Renderer, "exposure", "exposure total", exposure::SUMS);
+        }
+        if self.poses {
+            let sums = pose::SUMS * (self.budget.total as u64).div_ceil(pose::GROUP);
+            add(Section::Renderer, "gradient of the pose", "pose sums", sums);
+            add(Section::Renderer, "gradient of the pose", "pose total", pose::SUMS);
         }
         add(Section::Images, "photograph on the device", "truth", 4 * pixels);
         add(Section::Images, "photograph on the device", "mask", pixels.next_multiple_of(4));

@@ -7,7 +7,7 @@ use densify_policies::policy::MaskTerm;
 use super::frame::{due, target as target_flags};
 use super::observe::RenderedView;
 use super::passes::{Passes, Recorder};
-use super::{GpuBackend, Waiting};
+use super::{GpuBackend, Waiting, pose};
 use crate::candidates::{Photograph, error_weights};
 use crate::depth::{DepthLoss, DepthTerm};
 use crate::pixel_map::edge_weights;
@@ -32,10 +32,15 @@ impl GpuBackend {
         (bits, Waiting { main: !main, rest: !rest })
     }
 
-    /// Forward pass, loss, backward pass and optimiser.
-    pub(super) fn step(&mut self, input: &StepInput<'_>) -> Result<StepOutput, BackendError> {
+    /// Forward pass, loss, backward pass and optimiser; unless it `trains`, only the pose is differentiated.
+    pub(super) fn step(
+        &mut self,
+        input: &StepInput<'_>,
+        trains: bool,
+    ) -> Result<StepOutput, BackendError> {
         let StepInput { camera, target, background, exposure, .. } = *input;
         assert_same_size(camera, target);
+        assert!(!input.pose || self.sizes.poses, "the backend was not made for poses");
         let start = Instant::now();
         if self.sizes.alpha_and_depth {
             (self.sizes.alpha_and_depth, self.sizes.records) = (false, self.records);
@@ -44,7 +49,12 @@ impl GpuBackend {
         self.fit_image(camera.width, camera.height)?;
         let (due, waiting) = self.cadence_bits(input);
         let mut frame = self.frame(camera, background, input.sh_degree);
-        frame.draw[3] = self.load_photograph(input.view, target);
+        // Only training views are kept on the device.
+        frame.draw[3] = if trains {
+            self.load_photograph(input.view, target)
+        } else {
+            self.upload_target(target)
+        };
         self.load_exposure(&mut frame, exposure);
         let depth = self.load_depth(&mut frame, input);
         let trained = self.sizes.budget.trained(self.rows).max(1) as f32;
@@ -85,9 +95,14 @@ impl GpuBackend {
         };
         let step = |passes: &Passes<'_>, to: &mut Recorder<'_>| {
             passes.backward(to);
-            passes.optimise(to, degree, signals, mask);
+            if trains {
+                passes.optimise(to, degree, [input.pose, signals], mask);
+            } else {
+                passes.differentiate(to, true);
+            }
         };
-        let state = if let Some((request, count)) = self.candidates.due(input.step, self.rows) {
+        let picks = trains.then(|| self.candidates.due(input.step, self.rows)).flatten();
+        let state = if let Some((request, count)) = picks {
             let weights = error_weights(request.error);
             if let Some(weights) = weights {
                 frame.draw[3] |= target_flags::WITH_ERROR;
@@ -104,6 +119,10 @@ impl GpuBackend {
             let rendered = RenderedView { frame, shape, photograph };
             self.collect_candidates(&rendered, &request, count, search)?;
             self.continue_view(shape, step);
+            if input.pose {
+                let sums = self.read("pose total", 0, pose::SUMS)?;
+                self.pose_sums = bytemuck::pod_read_unaligned(bytemuck::cast_slice(&sums));
+            }
             state
         } else {
             let run = self.run(&frame, |passes, to| {
@@ -112,12 +131,15 @@ impl GpuBackend {
             })?;
             run.0
         };
-        self.waiting = waiting;
+        if trains {
+            self.waiting = waiting;
+        }
         if self.device.clock.is_none() {
             self.stage_times = vec![("device", start.elapsed())];
         }
         let exposure = exposure.map(|exposure| self.exposure_gradient(exposure, background));
         let given = input.depth.map(|_| state.depth);
-        Ok(StepOutput { exposure, depth: given, ..state.output() })
+        let pose = input.pose.then(|| pose::gradient(self.pose_sums));
+        Ok(StepOutput { exposure, pose, depth: given, ..state.output() })
     }
 }

@@ -1,9 +1,8 @@
 //! Submits a view's passes, and repeats them with more bands if there were too few.
 
-use super::exposure::SUMS;
 use super::frame::{Frame, State};
 use super::passes::{Passes, Recorder, Shape};
-use super::{GpuBackend, readback};
+use super::{GpuBackend, exposure, pose, readback};
 use crate::BackendError;
 
 impl GpuBackend {
@@ -32,16 +31,25 @@ impl GpuBackend {
             let staging = self.buffers.get("read");
             let state_bytes = size_of::<State>() as u64;
             encoder.copy_buffer_to_buffer(self.buffers.get("state"), 0, staging, 0, state_bytes);
-            let sums_bytes = if self.sizes.exposures { SUMS } else { 0 };
-            if sums_bytes > 0 {
-                let sums = self.buffers.get("exposure total");
-                encoder.copy_buffer_to_buffer(sums, 0, staging, state_bytes, sums_bytes);
+            let totals = [
+                (self.sizes.exposures, "exposure total", exposure::SUMS),
+                (self.sizes.poses, "pose total", pose::SUMS),
+            ];
+            let mut bytes = state_bytes;
+            for (_, name, length) in totals.iter().filter(|(exists, ..)| *exists) {
+                let total = self.buffers.get(name);
+                encoder.copy_buffer_to_buffer(total, 0, staging, bytes, *length);
+                bytes += length;
             }
-            let bytes = readback::finish(&self.device, staging, encoder, state_bytes + sums_bytes)?;
-            let (state, sums) = bytes.split_at(size_of::<State>());
+            let read = readback::finish(&self.device, staging, encoder, bytes)?;
+            let (state, mut read) = read.split_at(size_of::<State>());
             let state: State = bytemuck::pod_read_unaligned(state);
-            if sums_bytes > 0 {
-                self.exposure_sums = bytemuck::pod_read_unaligned(sums);
+            if self.sizes.exposures {
+                let (sums, others) = read.split_at(size_of_val(&self.exposure_sums));
+                (self.exposure_sums, read) = (bytemuck::pod_read_unaligned(sums), others);
+            }
+            if self.sizes.poses {
+                self.pose_sums = bytemuck::pod_read_unaligned(read);
             }
             if state.broken_off != 0 {
                 return Err(BackendError::LoopCut {

@@ -180,6 +180,11 @@ pub(crate) fn expected_coarse(
     )
 }
 
+/// The hint on how to refine poses if there are no tracks.
+pub(crate) fn refine_poses(s: Spelling) -> String {
+    format!("{} refines them anyway", s.text("poses", "refine"))
+}
+
 /// The hint on how to learn exposures if the tracks do not show whether exposures differ.
 pub(crate) fn learn_exposures(s: Spelling) -> String {
     format!("{} learns exposures anyway", s.text("exposure", "on"))

@@ -11,6 +11,7 @@ use super::degree::Degree;
 use super::exposure::Exposure;
 use super::fit::RunSize;
 use super::inputs::{Evidence, Inputs, Reading, choose_moments, open_device};
+use super::poses::RefinedPoses;
 use super::size::MIN_ROWS;
 use crate::failure::{Failure, ModelProblem, OptionProblem, SizeProblem};
 use crate::host::Host;
@@ -22,7 +23,9 @@ use densify_core::antialiasing::Antialiasing;
 use densify_core::budget::RowBudget;
 use densify_core::memory::Ledger;
 use densify_core::spelling::Spelling;
+use densify_data::dataset::View;
 use densify_train::exposure::ExposureChoice;
+use densify_train::poses::PoseChoice;
 use densify_train::schedule::Background;
 use densify_train::trainer::{AutoChoices, FLOATER_BYTES, floater_request, growth_signals};
 
@@ -53,6 +56,7 @@ pub(crate) struct Choices {
     pub(crate) knobs: Knobs,
     pub(crate) degree: Degree,
     pub(crate) exposure: Exposure,
+    pub(crate) poses: RefinedPoses,
     pub(crate) antialiasing: Antialiasing,
     pub(crate) near: NearPlane,
     pub(crate) position_rates: PositionRates,
@@ -75,25 +79,37 @@ pub(crate) enum Init {
 
 impl Choices {
     /// Messages about the choices that depend on the scene.
-    pub(super) fn lines(&self, spelling: Spelling) -> impl Iterator<Item = String> {
+    pub(super) fn lines(&self, spec: &RunSpec, spelling: Spelling) -> impl Iterator<Item = String> {
         let depths = self.near.line(spelling).into_iter().chain(self.position_rates.line());
-        depths.chain(self.degree.line()).chain(self.exposure.line(spelling))
+        let colours = self.degree.line().into_iter().chain(self.exposure.line(spelling));
+        depths.chain(colours).chain(self.poses.line(spec, spelling))
     }
+}
+
+/// Decisions by the evidence.
+struct Decisions {
+    degree: Degree,
+    exposure: Exposure,
+    poses: RefinedPoses,
 }
 
 impl<'a> Case<'a> {
     /// A new run.
     pub(super) fn for_new_run(spec: &'a RunSpec, host: Host<'_>) -> Result<Self, Failure> {
         let may_learn_exposures = spec.schedule.exposure != ExposureChoice::Off;
+        let may_refine = spec.schedule.poses != PoseChoice::Fixed;
         let reading = Reading {
-            tracks: spec.size.sh_degree == Some(ShDegree::Auto(None)) || may_learn_exposures,
+            tracks: spec.size.sh_degree == Some(ShDegree::Auto(None))
+                || may_learn_exposures
+                || may_refine,
             colours: true,
             exif: may_learn_exposures,
             ..Reading::default()
         };
-        Self::open(spec, &reading, host, |evidence| {
-            let degree = Degree::decide(spec, None, evidence);
-            (degree, Exposure::decide(spec, evidence))
+        Self::open(spec, &reading, host, |evidence, views| Decisions {
+            degree: Degree::decide(spec, None, evidence),
+            exposure: Exposure::decide(spec, evidence),
+            poses: RefinedPoses::decide(spec, evidence, views),
         })
     }
 
@@ -105,24 +121,29 @@ impl<'a> Case<'a> {
         host: Host<'_>,
     ) -> Result<Self, Failure> {
         let decides_exposures = spec.schedule.exposure != ExposureChoice::Off && !has_checkpoint;
+        let decides_poses = spec.schedule.poses != PoseChoice::Fixed && !has_checkpoint;
         let findings = &saved.resolved;
         let reading = Reading {
             // A checkpoint contains the rows of both models, so their files may no longer exist.
             models: Some([findings.init_model, findings.frozen]),
-            tracks: decides_exposures,
+            tracks: decides_exposures || decides_poses,
             colours: true,
             exif: decides_exposures,
             depth: Some(findings.depth.is_some()),
             tolerance: RESUME_TOLERANCE,
         };
-        Self::open(spec, &reading, host, |evidence| {
-            let degree = Degree::decide(spec, Some(findings.sh_degree_from), evidence);
-            let exposure = if has_checkpoint {
+        Self::open(spec, &reading, host, |evidence, views| Decisions {
+            degree: Degree::decide(spec, Some(findings.sh_degree_from), evidence),
+            exposure: if has_checkpoint {
                 Exposure::known(findings.has_exposures, findings.exposure_from)
             } else {
                 Exposure::decide(spec, evidence)
-            };
-            (degree, exposure)
+            },
+            poses: if has_checkpoint {
+                RefinedPoses::known(findings.refines_poses, findings.poses_from)
+            } else {
+                RefinedPoses::decide(spec, evidence, views)
+            },
         })
     }
 
@@ -133,10 +154,13 @@ impl<'a> Case<'a> {
         host: Host<'_>,
     ) -> Result<Self, Failure> {
         let has_exposures = spec.schedule.exposure != ExposureChoice::Off;
-        let reading = Reading { models: Some(models), tracks: has_exposures, ..Reading::default() };
-        let mut case = Self::open(spec, &reading, host, |evidence| {
-            let exposure = Exposure::known(has_exposures, super::ExposureSource::Given);
-            (Degree::decide(spec, None, evidence), exposure)
+        let refines_poses = spec.schedule.poses != PoseChoice::Fixed;
+        let tracks = has_exposures || refines_poses;
+        let reading = Reading { models: Some(models), tracks, ..Reading::default() };
+        let mut case = Self::open(spec, &reading, host, |evidence, _| Decisions {
+            degree: Degree::decide(spec, None, evidence),
+            exposure: Exposure::known(has_exposures, super::ExposureSource::Given),
+            poses: RefinedPoses::known(refines_poses, super::PoseSource::Given),
         })?;
         if case.inputs.device.adapter().is_none() {
             // The run will be another process, so what this one holds counts only if it includes a driver's kernels.
@@ -149,14 +173,14 @@ impl<'a> Case<'a> {
         spec: &'a RunSpec,
         reading: &Reading,
         host: Host<'_>,
-        decide: impl FnOnce(&Evidence) -> (Degree, Exposure),
+        decide: impl FnOnce(&Evidence, &[View]) -> Decisions,
     ) -> Result<Self, Failure> {
         let (entry, parameters) = spec.policy()?;
         let mut knobs = spec.knobs()?;
         check_automatic(spec)?;
         let device = open_device(spec, &mut knobs, host.observer)?;
         let (inputs, evidence) = Inputs::open(spec, device, reading, host)?;
-        let (degree, exposure) = decide(&evidence);
+        let Decisions { degree, exposure, poses } = decide(&evidence, &inputs.dataset.train);
         drop(evidence);
         for note in &exposure.notes {
             host.observer.say(format_args!("note: {note}"));
@@ -174,6 +198,7 @@ impl<'a> Case<'a> {
             knobs,
             degree,
             exposure,
+            poses,
             antialiasing: antialiasing(spec, &inputs)?,
             near: NearPlane::from_depths(spec.start.near, &seen),
             position_rates: PositionRates::choose(spec, &seen),

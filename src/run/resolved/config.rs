@@ -18,6 +18,7 @@ use densify_core::files::{FileError, write_atomically};
 use densify_data::dataset::{DepthFinding, is_archive};
 use densify_data::track_colours::Spread;
 use densify_data::track_colours::exposures::ExposureSpread;
+use densify_data::track_poses::PoseErrors;
 use densify_train::output::{CONFIG_FILE, FolderError};
 
 /// A resolved run as stored in its `config.toml`.
@@ -59,6 +60,12 @@ pub struct Findings {
     pub exposure_from: ExposureSource,
     /// True if exposures are learned.
     pub has_exposures: bool,
+    /// The reason for refining poses or not.
+    #[serde(skip_serializing_if = "PoseSource::is_given")]
+    pub poses_from: PoseSource,
+    /// True if poses are refined.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub refines_poses: bool,
     /// The model that the run started from.
     pub init_model: Option<ModelSize>,
     /// The model whose Gaussians never change.
@@ -101,6 +108,25 @@ pub enum ExposureSource {
     Tracks(ExposureSpread),
     /// No evidence: too few tracks are known, so exposures are not learned.
     Undecided,
+}
+
+/// The reason for refining the poses of the training views, or not.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum PoseSource {
+    /// The options.
+    #[default]
+    Given,
+    /// The tracks of the reconstruction, before training.
+    Tracks(PoseErrors),
+    /// No evidence: too few tracks are known.
+    Undecided,
+}
+
+impl PoseSource {
+    fn is_given(&self) -> bool {
+        *self == Self::Given
+    }
 }
 
 /// The reason for the spherical-harmonic degree of a run.
@@ -176,6 +202,8 @@ impl RunConfig {
             sh_degree_lowered: *degree_lowered,
             exposure_from: choices.exposure.source,
             has_exposures: choices.exposure.is_on,
+            poses_from: choices.poses.source,
+            refines_poses: choices.poses.is_on,
             init_model: inputs.init_model,
             frozen: inputs.frozen_model,
             depth: inputs.dataset.depth.clone(),

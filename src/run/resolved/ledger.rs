@@ -20,6 +20,7 @@ use densify_data::models::{Coordinates, Frame, PLY, Shape};
 use densify_render::{KeptPhotographs, MomentStorage, Setup, Shortcuts, Storage};
 use densify_train::exposure::Exposures;
 use densify_train::metrics::{geometry, scratch_bytes};
+use densify_train::poses::Poses;
 use densify_train::trainer::AutoChoices;
 
 /// Memory of the program itself `[bytes]`: the code pages in use, and the stacks of its threads. Measured at 15 to 17
@@ -41,8 +42,8 @@ const PLANNING_BYTES: u64 = 20;
 const THREAD_BYTES: u64 = 64 << 10;
 /// The ledger assumes at least this many threads, so that it is the same for all smaller numbers.
 const MIN_THREADS: usize = 64;
-/// Maximum bytes of a copy of the exposures and of their text, per byte of the exposures.
-const EXPOSURE_TEXT: u64 = 1 + 4;
+/// Maximum bytes of a copy of the exposures or poses and of their text, per byte of these.
+const STATE_TEXT: u64 = 1 + 4;
 /// Bytes of a point with its colour.
 const POINT_BYTES: u64 = (size_of::<DVec3>() + 3) as u64;
 
@@ -61,6 +62,7 @@ impl Case<'_> {
             shortcuts: self.choices.knobs.shortcuts,
             needs,
             exposures: self.choices.exposure.is_on,
+            poses: self.choices.poses.is_on,
             depth: self.has_depth(),
             ..Setup::default()
         }
@@ -118,6 +120,14 @@ impl Case<'_> {
         if exposures > 0 {
             ledger.add_to(Section::Model, "exposures of the views", exposures);
         }
+        let poses = if self.choices.poses.is_on {
+            Poses::bytes(self.inputs.dataset.train.len())
+        } else {
+            0
+        };
+        if poses > 0 {
+            ledger.add_to(Section::Model, "poses of the views", poses);
+        }
         if self.inputs.track_bytes > 0 {
             let bytes = self.inputs.track_bytes + train.held(0) + train.decoding(1);
             ledger.add_to(Section::Before, "colours of tracks", bytes);
@@ -148,7 +158,10 @@ impl Case<'_> {
                 ..Frame::WORLD
             },
         });
-        pass("export of the model, checkpoint", 2 * piece * row + held + EXPOSURE_TEXT * exposures);
+        pass(
+            "export of the model, checkpoint",
+            2 * piece * row + held + STATE_TEXT * (exposures + poses),
+        );
         if let Some(companion) = self.inputs.companion {
             let sizes = CompanionSize {
                 budget,

@@ -14,6 +14,7 @@ mod inputs;
 mod ledger;
 mod models;
 mod plan;
+mod poses;
 mod remedy;
 mod size;
 #[cfg(test)]
@@ -23,7 +24,7 @@ mod training;
 pub(crate) use case::{Case, DECODERS, Init, TEST_DECODERS};
 #[cfg(test)]
 pub(crate) use config::tests::sample;
-pub use config::{DegreeSource, ExposureSource, Findings, ModelSize, RunConfig};
+pub use config::{DegreeSource, ExposureSource, Findings, ModelSize, PoseSource, RunConfig};
 pub(crate) use coordinates::random_points;
 pub use estimate::{estimate, host_bytes};
 pub(crate) use fit::RunSize;
@@ -97,7 +98,7 @@ impl<'a> ResolvedRun<'a> {
 
     fn new(case: Case<'a>, size: &Size, degree_lowered: bool, host: Host<'_>) -> Self {
         let spelling = host.observer.spelling();
-        let scene = case.choices.lines(spelling);
+        let scene = case.choices.lines(case.spec, spelling);
         let init = case.first_rows(size.run_size.rows);
         let coordinates = coordinates::line(&case, size.run_size.rows, &init, spelling);
         let reasons = scene.chain(size.lines(&case, spelling)).chain(coordinates).collect();

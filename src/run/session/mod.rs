@@ -136,8 +136,11 @@ fn has_no_results(folder: &Path) -> bool {
 /// Writes the cameras of all views in world coordinates, or relative to an offset.
 fn write_cameras(run: &Run, folder: &Path, offset: Option<[f64; 3]>) -> Result<(), FileError> {
     let to_world = &run.dataset.normalisation;
-    let cameras = run.dataset.test.iter().chain(&run.dataset.train).map(|view| {
-        let mut camera = to_world.world_from_scene_camera(&view.camera);
+    let test = run.dataset.test.iter().map(|view| (view, view.camera));
+    let train = run.dataset.train.iter().enumerate();
+    let train = train.map(|(number, view)| (view, run.trainer.camera(number)));
+    let cameras = test.chain(train).map(|(view, camera)| {
+        let mut camera = to_world.world_from_scene_camera(&camera);
         if let Some(offset) = offset {
             camera.translation += camera.rotation * DVec3::from(offset);
         }
@@ -377,9 +380,10 @@ impl<'a> Session<'a> {
         PLY.write_file(&path, shape, |piece| {
             Ok::<_, Failure>(to_world.world_from_model(backend.download_rows(piece)?, frame.origin))
         })?;
-        if let Some(offset) = frame.offset() {
+        let has_moved = self.run.trainer.progress().poses.is_some();
+        if has_moved || frame.offset().is_some() {
             // Viewers show the model with these cameras.
-            write_cameras(&self.run, &self.folder, Some(offset))?;
+            write_cameras(&self.run, &self.folder, frame.offset())?;
         }
         if let Some(exposures) = &self.run.trainer.progress().exposures {
             let names = self.run.dataset.train.iter().map(|view| &*view.name);
@@ -399,7 +403,8 @@ impl<'a> Session<'a> {
         let (background, degree) = (spec.data.background.fixed(), config.sh_degree);
         let observer = self.observer;
         let fits_exposure = config.resolved.has_exposures;
-        let comparison = Comparison { lpips: None, fits_exposure };
+        let fits_pose = trainer.progress().poses.is_some();
+        let comparison = Comparison { lpips: None, fits_exposure, fits_pose };
         let scores = evaluate(trainer.backend(), test, background, degree, comparison, |_| {
             observer.interrupt().map_or(ControlFlow::Continue(()), |_| ControlFlow::Break(()))
         });

@@ -64,9 +64,13 @@ impl Session<'_> {
                 "test     PSNR {psnr:.2} dB, SSIM {ssim:.4}, FLIP {flip:.4} (mean of {views} views)"
             ));
             if let Some(FittedScore { psnr, ssim, flip, .. }) = fitted {
+                let what = match (config.resolved.has_exposures, config.resolved.refines_poses) {
+                    (true, true) => "pose and exposure",
+                    (false, true) => "pose",
+                    (_, false) => "exposure",
+                };
                 self.observer.say(format_args!(
-                    "fitted   PSNR {psnr:.2} dB, SSIM {ssim:.4}, FLIP {flip:.4}, with the best exposure of \
-                     each view"
+                    "fitted   PSNR {psnr:.2} dB, SSIM {ssim:.4}, FLIP {flip:.4}, with the best {what} of each view"
                 ));
             }
         }

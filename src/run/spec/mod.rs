@@ -32,6 +32,7 @@ use densify_data::dataset::{DepthAlong, DepthChoice, DepthUnit, FarCameras, Mask
 use densify_data::models::Coordinates;
 use densify_render::{BackendChoice, DepthTerm};
 use densify_train::exposure::{ExposureChoice, ExposureModel};
+use densify_train::poses::PoseChoice;
 use densify_train::schedule::{Background, InitRates, REFERENCE_ITERATIONS};
 use densify_train::trainer::{Annealed, OnNan};
 use values::as_table;
@@ -338,6 +339,14 @@ run_spec! {
 
         /// Form of the learned exposures
         exposure_model: ExposureModel = ExposureModel::Channels, Fixed, value "MODEL";
+
+        /// Refine the poses of the training photographs: first by the points of the reconstruction, then together with
+        /// the model. Test views are then measured both as given and from the pose that fits best. auto needs the tracks
+        /// of a reconstruction
+        poses: PoseChoice = PoseChoice::Fixed, Fixed, value "WHEN";
+
+        /// With refined poses, adjust the focal length of each lens by the points as well
+        refine_focal: bool = false, Fixed, switch Set;
 
         /// Treatment of Gaussians with a non-finite value; the model is checked at least every 100 iterations
         on_nan: OnNan = OnNan::Prune, Free, value "ACTION";

@@ -89,6 +89,7 @@ impl RowMeasurements {
                 target: &image,
                 background: scene.background,
                 exposure: None,
+                pose: false,
                 depth: None,
                 distortion: 0.0,
                 sh_degree,

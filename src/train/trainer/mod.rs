@@ -13,6 +13,7 @@ mod near_duplicates;
 mod nonfinite;
 mod options;
 mod policy_views;
+mod pose;
 mod progress;
 mod report;
 mod resolution;
@@ -27,6 +28,7 @@ use densify_policies::policy::{
 };
 
 use crate::exposure::Exposures;
+use crate::poses::Poses;
 use crate::schedule;
 pub use auto_budget::{AutoBudget, Interval, MIN_GAIN, Removal, growth_signals};
 use densify_core::image::SharedImage;
@@ -135,6 +137,18 @@ impl<V: ViewSource> Trainer<V> {
         self
     }
 
+    /// Enables refinement of the poses; call it before the first step. The backend must have been created for it.
+    ///
+    /// # Panics
+    /// When the numbers of poses and of views differ, which is a bug in the caller.
+    #[must_use]
+    pub fn with_poses(mut self, poses: Option<Poses>) -> Self {
+        let count = poses.as_ref().map_or(self.views.count(), Poses::count);
+        assert_eq!(count, self.views.count(), "the numbers of poses and of views differ");
+        self.state.poses = poses;
+        self
+    }
+
     /// One iteration: a view, a gradient step, and the policy's edit if it is due.
     ///
     /// May be called beyond [`TrainOptions::iterations`]; step sizes then keep their final values.
@@ -165,6 +179,7 @@ impl<V: ViewSource> Trainer<V> {
             target: &image,
             background: background.at(seed, step),
             exposure: exposure.as_ref(),
+            pose: self.state.poses.is_some(),
             depth: depth.and_then(|(training, map)| training.target(map, progress)),
             distortion: distortion(self.options.distortion, progress),
             sh_degree: self.sh_degree(step),
@@ -183,6 +198,7 @@ impl<V: ViewSource> Trainer<V> {
         if let Some((exposures, gradient)) = self.state.exposures.as_mut().zip(output.exposure) {
             exposures.step(view, &gradient, progress);
         }
+        self.move_pose(step, view, &output, progress);
         let is_due = self.ask_policy(step, |policy| policy.is_due(step))?;
         let mut events = Vec::new();
         if is_due || step.is_multiple_of(AUDIT_EVERY) || step == iterations {

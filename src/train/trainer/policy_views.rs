@@ -37,11 +37,12 @@ impl<V: ViewSource> Trainer<V> {
         let (image, depth) = self.image_with_depth(step, view)?;
         let exposure = self.state.exposures.as_ref().map(|exposures| exposures.transform(view));
         let (options, sh_degree) = (self.options, self.sh_degree(step));
+        let camera = self.camera(view);
         let measured = self.backend.observe(&AuxInput {
             step,
             view,
             seed: options.seed,
-            camera: self.views.camera(view),
+            camera: &camera,
             target: &image,
             background: options.background.at(options.seed, step),
             exposure: exposure.as_ref(),

@@ -28,7 +28,7 @@ impl<V: ViewSource> Trainer<V> {
         let scale = self.ask_policy(step, |policy| policy.resolution(step))?;
         let checked = self.needs.check_resolution(scale).map_err(PolicyError::Other);
         checked.map_err(|error| self.policy_error(step, error))?;
-        let camera = *self.views.camera(view);
+        let camera = self.camera(view);
         let (width, height) = shrunk((camera.width, camera.height), scale);
         if (width, height) == (camera.width, camera.height) {
             return Ok((camera, image, depth));

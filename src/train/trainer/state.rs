@@ -10,6 +10,7 @@ use serde::{Deserialize, Serialize};
 use super::policy_views::call_policy;
 use super::{AutoBudget, EditEvent, Trainer};
 use crate::exposure::Exposures;
+use crate::poses::Poses;
 use crate::schedule;
 use densify_data::views::ViewSource;
 
@@ -39,6 +40,9 @@ pub struct TrainerState {
     /// Exposures of the training views, if they are learned.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub exposures: Option<Exposures>,
+    /// Poses of the training views, if they are refined.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub poses: Option<Poses>,
 }
 
 impl<V: ViewSource> Trainer<V> {
@@ -63,6 +67,12 @@ impl<V: ViewSource> Trainer<V> {
             (Some(saved), Some(own)) => saved.check_matches(own),
             (None, None) => Ok(()),
             _ => Err("either the checkpoint or this run has exposures, but not both".to_owned()),
+        };
+        matches.map_err(PolicyError::Other)?;
+        let matches = match (&state.poses, &self.state.poses) {
+            (Some(saved), Some(own)) => saved.check_matches(own),
+            (None, None) => Ok(()),
+            _ => Err("either the checkpoint or this run refines poses, but not both".to_owned()),
         };
         matches.map_err(PolicyError::Other)?;
         self.scene.initial_rows = state.initial_rows;

@@ -8,7 +8,7 @@ use std::fs::File;
 use std::io::{BufReader, Read};
 use std::path::Path;
 
-use glam::DVec3;
+use glam::{DVec2, DVec3};
 
 use super::super::LoadError;
 use super::super::PointCloud;
@@ -185,6 +185,26 @@ pub(super) fn images(path: &Path) -> Result<Vec<Image>, LoadError> {
     Ok(images)
 }
 
+/// Passes the observations of images.bin to `see`: the image's id, the observation's index in it, and its place `[px]`.
+pub(super) fn observations(
+    path: &Path,
+    see: &mut dyn FnMut(u32, u32, DVec2),
+) -> Result<(), LoadError> {
+    let mut reader = Reader::open(path)?;
+    for _ in 0..read_image_count(&mut reader)? {
+        let id = reader.u32("image id")?;
+        let field = format!("image id {id}");
+        reader.skip(&field, 1, 56 + 4)?;
+        reader.name(&field)?;
+        for observation in 0..reader.count(&field, 24, u64::from(u32::MAX))? {
+            let [x, y] = reader.f64s::<2>(&field)?;
+            reader.skip(&field, 1, 8)?;
+            see(id, observation as u32, DVec2::new(x, y));
+        }
+    }
+    Ok(())
+}
+
 /// Reads points3D.bin, and passes its tracks to `tracks`.
 pub(super) fn points(
     path: &Path,
@@ -209,8 +229,7 @@ pub(super) fn points(
         {
             let mut ids = Vec::new();
             for _ in 0..views.min(MAX_VIEWS) {
-                ids.push(reader.u32(field)?);
-                reader.skip(field, 1, 4)?;
+                ids.push((reader.u32(field)?, reader.u32(field)?));
             }
             left -= ids.len() as u64;
             tracks.add(position, colour, ids);

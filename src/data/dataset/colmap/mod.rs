@@ -273,7 +273,21 @@ fn model(
         true if is_binary(&points) => bin::points(&points, tracks)?,
         true => txt::points(&points, tracks)?,
     };
-    let tracks = sampler.map(TrackSampler::finish).unwrap_or_default();
+    let by_id: HashMap<u32, &Image> = posed.iter().map(|image| (image.id, image)).collect();
+    let read = if is_binary(&images) { bin::observations } else { txt::observations };
+    let tracks = sampler.map_or(Ok(Tracks::default()), |sampler| {
+        sampler.finish(|see| {
+            read(&images, &mut |id, observation, pixel| {
+                let image = by_id.get(&id);
+                let lens = image.and_then(|image| lenses.get(&image.camera));
+                let local = lens.and_then(|lens| lens.unproject(pixel).ok());
+                if let Some((image, local)) = image.zip(local) {
+                    let world = image.rotation.transpose() * local.normalize();
+                    see(id, observation, world);
+                }
+            })
+        })
+    })?;
     Ok(([cameras, images, points], Model { cameras: lenses, images: posed, points: cloud, tracks }))
 }
 

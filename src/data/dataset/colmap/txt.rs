@@ -7,7 +7,7 @@ use std::io::{BufRead, BufReader, Read};
 use std::path::Path;
 use std::str::{FromStr, SplitWhitespace};
 
-use glam::DVec3;
+use glam::{DVec2, DVec3};
 
 use super::super::LoadError;
 use super::super::PointCloud;
@@ -176,6 +176,35 @@ pub(super) fn images(path: &Path) -> Result<Vec<Image>, LoadError> {
     Ok(images)
 }
 
+/// Passes the observations of images.txt, which [`images`] has read, to `see`: the image's id, the observation's index
+/// in it, and its place `[px]`.
+pub(super) fn observations(
+    path: &Path,
+    see: &mut dyn FnMut(u32, u32, DVec2),
+) -> Result<(), LoadError> {
+    let mut lines = Lines::open(path)?;
+    let mut is_ahead = false;
+    while is_ahead || lines.advance_to_record()? {
+        let id: u32 = lines.number(&mut lines.text()?.split_whitespace(), "image id")?;
+        lines.advance()?;
+        let is_comment = lines.line.trim_ascii_start().starts_with(b"#");
+        is_ahead = !is_comment && has_non_number(lines.text()?);
+        if is_ahead || is_comment {
+            continue;
+        }
+        let mut words = lines.text()?.split_whitespace();
+        let mut observation = 0;
+        while let (Some(x), Some(y), Some(_)) = (words.next(), words.next(), words.next()) {
+            // A place that is no number is unknown.
+            if let (Ok(x), Ok(y)) = (x.parse(), y.parse()) {
+                see(id, observation, DVec2::new(x, y));
+            }
+            observation += 1;
+        }
+    }
+    Ok(())
+}
+
 /// Returns true if a line contains a word that is not a number, such as the name of an image. Only the first 100 words
 /// are tested, because only lines of observations have more.
 fn has_non_number(text: &str) -> bool {
@@ -213,12 +242,12 @@ pub(super) fn points(
             let views = words.clone().count() as u64 / 2;
             if tracks.wants(views) {
                 let mut ids = Vec::new();
-                while let (Some(id), Some(_)) = (words.next(), words.next()) {
-                    ids.push(
-                        id.parse().map_err(|_| {
-                            lines.fault("track", format!("{id:?} is not an image id"))
-                        })?,
-                    );
+                while let (Some(id), Some(observation)) = (words.next(), words.next()) {
+                    let id = id
+                        .parse()
+                        .map_err(|_| lines.fault("track", format!("{id:?} is not an image id")))?;
+                    // Some programs write −1 where they know of no observation.
+                    ids.push((id, observation.parse().unwrap_or(u32::MAX)));
                 }
                 tracks.add(position, colour, ids);
             }

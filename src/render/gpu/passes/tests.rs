@@ -154,7 +154,7 @@ fn count_step(depth: bool) -> Vec<Tally> {
     }
     passes.loss(&mut counter, false, true);
     passes.backward(&mut counter);
-    passes.optimise(&mut counter, 3, true, None);
+    passes.optimise(&mut counter, 3, [false, true], None);
     counter.stages
 }
 

@@ -42,8 +42,8 @@ impl<V: ViewSource> Trainer<V> {
             let image = self.image(step, view)?;
             let exposure = self.state.exposures.as_ref().map(|exposures| exposures.transform(view));
             let unexposed = exposure.map_or(background, |exposure| exposure.behind(background));
-            let mut rendering =
-                self.backend.render(self.views.camera(view), unexposed, sh_degree).at(step)?;
+            let camera = self.camera(view);
+            let mut rendering = self.backend.render(&camera, unexposed, sh_degree).at(step)?;
             self.state.extra_forwards += 1;
             if let Some(exposure) = exposure {
                 for colour in rendering.rgb.as_chunks_mut::<3>().0 {

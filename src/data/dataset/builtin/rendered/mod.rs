@@ -156,15 +156,27 @@ fn dataset(
     let name = |photograph: &Photograph| photograph.views[0].name.clone();
     photographs.sort_by_cached_key(name);
     let mut sampler = TrackSampler::new();
-    let coloured = points.positions.iter().zip(&points.colours);
-    for ((&position, &colour), seen_by) in coloured.zip(&points.seen_by) {
+    let mut found_at = Vec::new();
+    let coloured = points.positions.iter().zip(&points.colours).zip(&points.found_at);
+    for (((&position, &colour), &at), seen_by) in coloured.zip(&points.seen_by) {
         if options.tracks && sampler.wants(seen_by.len() as u64) {
-            sampler.add(position, colour, seen_by.iter().copied());
+            let number = found_at.len() as u32;
+            sampler.add(position, colour, seen_by.iter().map(|&view| (view, number)));
+            found_at.push((at, seen_by));
         }
     }
+    let tracks = sampler.finish(|see| {
+        for (number, (at, seen_by)) in (0..).zip(&found_at) {
+            for &view in *seen_by {
+                let centre = summary.views[view as usize].camera.centre;
+                see(view, number, (*at - centre).normalize());
+            }
+        }
+        Ok::<_, LoadError>(())
+    })?;
     let read = dataset::Scene {
         points: PointCloud { positions: points.positions, colours: points.colours },
-        tracks: sampler.finish(),
+        tracks,
         own_split: true,
         surface_bytes: Some(summary.surface_bytes),
         ..dataset::Scene::default()

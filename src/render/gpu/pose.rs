@@ -1,0 +1,14 @@
+//! The gradient with respect to the camera's pose: what the kernels of `shaders/project_bwd.wgsl` leave.
+
+use densify_core::pose::{PoseGradient, Twist};
+
+/// Bytes of the sums of a group of rows, or of all rows.
+pub(super) const SUMS: u64 = 2 * 16;
+/// Rows per group.
+pub(super) const GROUP: u64 = 256;
+
+/// The gradient from the sums over all rows.
+pub(super) fn gradient(sums: [[f32; 4]; 2]) -> PoseGradient {
+    let [[x, y, z, _], [a, b, c, log_focal]] = sums.map(|sums| sums.map(f64::from));
+    Twist::from_array([x, y, z, a, b, c, log_focal])
+}
