@@ -54,6 +54,8 @@ TYPES = {
     "knob": "Mapping[str, Any]",
     "exposure": "str",
     "exposure_model": "str",
+    "poses": "str",
+    "refine_focal": "bool",
     "on_nan": "str",
     "deterministic": "bool",
     "backend": "str",

@@ -14,6 +14,7 @@ use densify_render::{Backend, Rendering};
 use densify_train::evaluate::Split;
 use densify_train::exposure::{ExposureChoice, ExposureModel, fitted};
 use densify_train::metrics::psnr;
+use densify_train::poses::PoseChoice;
 
 use crate::failure::Failure;
 use crate::finished::views_of;
@@ -44,6 +45,8 @@ pub struct TrainedModel {
     pub depth: DepthSpec,
     /// Exposure model, if the model was trained with an exposure per photograph.
     pub exposure: Option<ExposureModel>,
+    /// Whether the poses of the model's run were refined, and focal lengths with them.
+    pub poses: (PoseChoice, bool),
     /// Near plane, as a fraction of the scene's extent; `None`: the usual near plane of the dataset.
     pub near: Option<Fraction>,
 }
@@ -95,14 +98,18 @@ impl TrainedModel {
                 ))
             })?;
             let (data, depth, near) = given;
-            return Ok(Self { file, scene, data, depth, exposure: None, near });
+            let poses = (PoseChoice::Fixed, false);
+            return Ok(Self { file, scene, data, depth, exposure: None, poses, near });
         }
         let config = RunConfig::read(model)?;
         let scene = scene.unwrap_or_else(|| config.scene_path());
         let exposure = config.resolved.has_exposures;
         let exposure = exposure.then_some(config.spec.schedule.exposure_model);
+        let choice =
+            if config.resolved.refines_poses { PoseChoice::Refine } else { PoseChoice::Fixed };
+        let poses = (choice, config.spec.schedule.refine_focal);
         let RunSpec { data, depth, start, .. } = config.spec;
-        Ok(Self { file, scene, data, depth, exposure, near: start.near })
+        Ok(Self { file, scene, data, depth, exposure, poses, near: start.near })
     }
 
     /// Describes the run that trains `model`, which is or will be saved in `scratch`.
@@ -140,6 +147,7 @@ impl TrainedModel {
             spec.schedule.exposure = ExposureChoice::On;
             spec.schedule.exposure_model = exposure_model;
         }
+        (spec.schedule.poses, spec.schedule.refine_focal) = self.poses;
         spec.output.coordinates =
             if model.is_local() { Coordinates::Local } else { Coordinates::World };
         Ok(spec)

@@ -3,8 +3,8 @@
 //! A track is a point and the directions in which photographs show it. Poses and points are adjusted in turn until the
 //! points are seen in these directions (bundle adjustment by resection and intersection, each a Gauss-Newton step with
 //! Huber weights). Poses from a reconstruction are already where this leads; poses with errors of their own move, by a
-//! distance in the picture that is measured in pixels. The world is not moved: at the end the points are where they were
-//! on average, so that test views and first Gaussians stay in place.
+//! distance in the picture that is measured in pixels. The world is not moved: at the end cameras and points are where they
+//! were on average, so that test views and first Gaussians stay in place.
 
 use std::collections::HashMap;
 
@@ -19,10 +19,12 @@ use densify_core::linear::{NormalEquations, solve};
 use densify_core::pose::Twist;
 use densify_core::similarity::Similarity;
 
+/// Rounds of adjusting only poses, or only points, to find what explains the tracks better.
+const FIRST_ROUNDS: usize = 3;
 /// Rounds of adjusting poses and points.
-const ROUNDS: usize = 40;
+const ROUNDS: usize = 150;
 /// A round that moves no view by more than this ends the adjustment `[px]`, root mean square.
-const SETTLED: f64 = 1e-3;
+const SETTLED: f64 = 2e-4;
 /// Smallest number of points that determine the pose of a view.
 const MIN_POINTS: usize = 12;
 /// Residuals beyond this multiple of their robust standard deviation have less weight (Huber).
@@ -34,7 +36,7 @@ const DAMPING: f64 = 1e-6;
 /// Least cosine of the angle between a point's directions in two views at which its distance is known: two degrees.
 const WIDEST_PARALLEL: f64 = 0.999_39;
 /// Smallest motion in the picture for which refinement pays `[px]`; a sixth of a pixel costs 2 dB.
-const MIN_MOTION: f64 = 0.25;
+const MIN_MOTION: f64 = 0.15;
 /// A motion counts if it is larger than this many of its standard errors.
 const SIGNIFICANT: f64 = 3.0;
 
@@ -59,7 +61,12 @@ pub struct PoseErrors {
 impl PoseErrors {
     /// True if the poses should be refined.
     pub fn are_off(&self) -> bool {
-        self.motion >= MIN_MOTION.max(SIGNIFICANT * self.uncertainty)
+        self.motion >= MIN_MOTION && self.is_significant()
+    }
+
+    /// True if noise of the tracks does not explain the motion.
+    pub fn is_significant(&self) -> bool {
+        self.motion > SIGNIFICANT * self.uncertainty
     }
 }
 
@@ -88,8 +95,15 @@ pub fn adjust(tracks: &Tracks, given: &[Camera], with_focal: bool) -> Option<Adj
     if known < MIN_TRACKS {
         return None;
     }
-    let mut state = State::new(tracks, given.to_vec(), sightings);
-    let before = state.deviation() / MEDIAN_TO_DEVIATION;
+    let start = State::new(tracks, given.to_vec(), sightings);
+    let before = start.deviation() / MEDIAN_TO_DEVIATION;
+    // Either the points or the poses may be what is right, so what explains the tracks better is held fixed at first.
+    let (mut by_poses, mut by_points) = (start.clone(), start);
+    for _ in 0..FIRST_ROUNDS {
+        by_poses.step_poses(by_poses.deviation().max(LEAST_DEVIATION), with_focal);
+        by_points.step_points(by_points.deviation().max(LEAST_DEVIATION));
+    }
+    let mut state = if by_poses.deviation() < by_points.deviation() { by_poses } else { by_points };
     for _ in 0..ROUNDS {
         let deviation = state.deviation().max(LEAST_DEVIATION);
         let moved = state.step_poses(deviation, with_focal);
@@ -98,7 +112,7 @@ pub fn adjust(tracks: &Tracks, given: &[Camera], with_focal: bool) -> Option<Adj
             break;
         }
     }
-    state.restore_world(&tracks.positions);
+    state.restore_world(given, &tracks.positions);
     let errors = state.errors(given, before);
     (errors.views > 0).then_some(Adjusted { cameras: state.cameras, errors })
 }
@@ -136,6 +150,7 @@ struct Eliminated {
 }
 
 /// The adjustment in progress.
+#[derive(Clone)]
 struct State {
     cameras: Vec<Camera>,
     points: Vec<DVec3>,
@@ -293,23 +308,39 @@ impl State {
         self.points = (0..this.points.len()).into_par_iter().map(step).collect();
     }
 
-    /// Moves everything by the similarity that takes the points back to where they were, by least squares of those that
-    /// have moved least.
-    fn restore_world(&mut self, positions: &[DVec3]) {
+    /// Moves everything back by the similarity that the world has drifted by: that of the cameras, or of the points,
+    /// whichever is known more precisely.
+    fn restore_world(&mut self, given: &[Camera], positions: &[DVec3]) {
+        let cameras: Vec<[Camera; 2]> =
+            self.cameras.iter().zip(given).map(|(now, given)| [*now, *given]).collect();
+        self.move_by(&Similarity::between_cameras(&cameras));
+        let moved = self.cameras.iter().zip(given).map(|(a, b)| a.centre().distance(b.centre()));
+        let of_cameras = median(moved.collect()).unwrap_or(0.0) / (given.len() as f64).sqrt();
         let seen = |track: &usize| self.of_track[*track].len() > 1;
         let mut pairs: Vec<[DVec3; 2]> = (0..positions.len())
             .filter(seen)
             .map(|track| [self.points[track], positions[track]])
             .collect();
-        let apart = |[a, b]: &[DVec3; 2]| a.distance_squared(*b);
-        pairs.sort_by(|a, b| apart(a).total_cmp(&apart(b)));
-        pairs.truncate((pairs.len() * 9).div_ceil(10));
-        let back = Similarity::between(&pairs);
+        // Points that have moved far are left out, twice, since what is far changes with the similarity.
+        let mut back = Similarity::IDENTITY;
+        let apart = |back: &Similarity, [a, b]: &[DVec3; 2]| back.point(*a).distance_squared(*b);
+        for _ in 0..2 {
+            pairs.sort_by(|a, b| apart(&back, a).total_cmp(&apart(&back, b)));
+            back = Similarity::between(&pairs[..(pairs.len() * 4).div_ceil(5)]);
+        }
+        let distances = pairs.iter().map(|pair| apart(&back, pair).sqrt());
+        let of_points = median(distances.collect()).unwrap_or(0.0) / (pairs.len() as f64).sqrt();
+        if of_points < of_cameras {
+            self.move_by(&back);
+        }
+    }
+
+    fn move_by(&mut self, similarity: &Similarity) {
         for point in &mut self.points {
-            *point = back.point(*point);
+            *point = similarity.point(*point);
         }
         for camera in &mut self.cameras {
-            *camera = back.camera(camera);
+            *camera = similarity.camera(camera);
         }
     }
 

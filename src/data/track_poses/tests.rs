@@ -115,6 +115,18 @@ fn focal_lengths_of_a_lens_return_too() {
     assert!(off(&found.cameras, &scene.truth) < 0.2 * off(&given, &scene.truth));
 }
 
+/// Points that were placed badly are no reason to move poses.
+#[test]
+fn wrong_points_do_not_move_right_poses() {
+    let (mut scene, given) = disturbed(0.0, 0.0);
+    let mut rng = ChaCha8Rng::seed_from_u64(9);
+    for position in &mut scene.tracks.positions {
+        *position += 0.05 * DVec3::new(rng.random(), rng.random(), rng.random());
+    }
+    let found = adjust(&scene.tracks, &given, false).expect("enough tracks");
+    assert!(!found.errors.are_off() && found.errors.before > 1.0, "{:?}", found.errors);
+}
+
 /// A tenth of the points are seen somewhere else in a view.
 #[test]
 fn wrong_tracks_do_not_move_poses() {

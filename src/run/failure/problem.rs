@@ -6,6 +6,7 @@ use std::path::PathBuf;
 use densify_core::antialiasing::Antialiasing;
 use densify_data::LoadError;
 use densify_render::{Accumulation, BackendKind};
+use densify_train::poses::PoseChoice;
 
 /// A problem with options: with one by itself, or with several that contradict each other.
 #[derive(Debug, Clone, PartialEq)]
@@ -41,6 +42,10 @@ pub enum OptionProblem {
     AutomaticWithFull { option: &'static str },
     /// An automatic budget cannot remove frozen Gaussians.
     AutoBudgetWithFreeze,
+    /// Frozen Gaussians do not move with the poses.
+    PosesWithFreeze { choice: PoseChoice },
+    /// Focal lengths are to be refined, but not poses.
+    FocalWithoutPoses,
     /// A number of random points is given, but the run does not start from random points.
     UnusedInitPoints { points: usize },
     /// Test views are to be measured, but there are none.

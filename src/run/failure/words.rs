@@ -226,6 +226,16 @@ impl OptionProblem {
                  number of Gaussians",
                 s.text("budget", "auto")
             ),
+            Self::PosesWithFreeze { choice } => format!(
+                "{}: the Gaussians of {freeze} cannot follow moving poses; refine the poses in the run that makes them, \
+                 or leave one of the two out",
+                s.text("poses", choice.name())
+            ),
+            Self::FocalWithoutPoses => format!(
+                "{}: focal lengths are adjusted together with poses; add {}",
+                s.switch("refine_focal"),
+                s.text("poses", "refine")
+            ),
             Self::UnusedInitPoints { points } => format!(
                 "{}: it is for a random start; leave it out, or use {}",
                 s.set("init_points", points),

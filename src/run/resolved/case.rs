@@ -356,7 +356,7 @@ fn random_points(trainable: usize) -> usize {
     (trainable / 2).clamp(1, RANDOM_POINTS)
 }
 
-/// Fails if an automatic choice contradicts `--full` or `--freeze`.
+/// Fails if an automatic choice contradicts `--full` or `--freeze`, or options about poses contradict others.
 fn check_automatic(spec: &RunSpec) -> Result<(), Failure> {
     let is_auto_budget = spec.size.budget.is_some_and(Budget::is_auto);
     let is_auto_degree = matches!(spec.size.sh_degree, Some(ShDegree::Auto(_)));
@@ -367,6 +367,12 @@ fn check_automatic(spec: &RunSpec) -> Result<(), Failure> {
     }
     if is_auto_budget && spec.start.freeze.is_some() {
         return Err(OptionProblem::AutoBudgetWithFreeze.into());
+    }
+    if spec.schedule.poses != PoseChoice::Fixed && spec.start.freeze.is_some() {
+        return Err(OptionProblem::PosesWithFreeze { choice: spec.schedule.poses }.into());
+    }
+    if spec.schedule.refine_focal && spec.schedule.poses == PoseChoice::Fixed {
+        return Err(OptionProblem::FocalWithoutPoses.into());
     }
     Ok(())
 }

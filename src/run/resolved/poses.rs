@@ -40,10 +40,11 @@ impl RefinedPoses {
             Some(Adjusted { cameras, errors }) => (cameras, Some(errors)),
             None => (Vec::new(), None),
         };
-        let is_off = errors.is_some_and(|errors| errors.are_off());
-        let is_on = choice == PoseChoice::Refine || is_off;
+        let asked = choice == PoseChoice::Refine;
+        let is_on = asked || errors.is_some_and(|errors| errors.are_off());
+        let is_known = errors.is_some_and(|errors| errors.is_significant());
         let source = errors.map_or(PoseSource::Undecided, PoseSource::Tracks);
-        Self { is_on, source, adjusted: if is_off { adjusted } else { Vec::new() } }
+        Self { is_on, source, adjusted: if is_on && is_known { adjusted } else { Vec::new() } }
     }
 
     /// The poses that the run starts with, if poses are refined.
@@ -79,7 +80,7 @@ impl RefinedPoses {
                 errors.motion,
                 errors.uncertainty,
                 errors.before,
-                if errors.are_off() {
+                if !self.adjusted.is_empty() {
                     format!(", {:.2} px after an adjustment", errors.after)
                 } else {
                     String::new()

@@ -5,7 +5,7 @@ use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 
-use crate::resolved::{DegreeSource, ExposureSource, RunConfig};
+use crate::resolved::{DegreeSource, ExposureSource, PoseSource, RunConfig};
 use densify_core::files::FileError;
 use densify_core::gaussians::MAX_SH_DEGREE;
 use densify_core::numbers::counted;
@@ -31,6 +31,10 @@ pub struct Requirements {
     pub exposures: bool,
     /// The reason for learning exposures or not.
     pub exposures_from: ExposureSource,
+    /// True if the poses of the training views were refined.
+    pub poses: bool,
+    /// The reason for refining poses or not.
+    pub poses_from: PoseSource,
     /// Measurements of `--budget auto`.
     pub rows: Option<AutoBudget>,
     /// Number of training views not rendered for scores because of near-duplicates.
@@ -95,6 +99,7 @@ impl Requirements {
         let left_out = [
             degree_left_out(config),
             exposures_left_out(config),
+            poses_left_out(config),
             auto_budget.and_then(|auto| rows_left_out(auto, rows, config.budget)),
             auto_budget.and_then(rows_removed),
             (unscored_views > 0).then(|| unscored(unscored_views)),
@@ -105,6 +110,8 @@ impl Requirements {
             sh_degree_from: config.resolved.sh_degree_from,
             exposures: config.resolved.has_exposures,
             exposures_from: config.resolved.exposure_from,
+            poses: config.resolved.refines_poses,
+            poses_from: config.resolved.poses_from,
             rows: auto_budget.cloned(),
             unscored_views,
             depth: config.resolved.depth.clone().and_then(|given| {
@@ -172,6 +179,18 @@ fn exposures_left_out(config: &RunConfig) -> Option<LeftOut> {
         evidence: format!(
             "judged by the colours of {} points, the exposures of {} views differ by {:.2} stops (rms)",
             spread.tracks, spread.views, spread.stops
+        ),
+        loss: "the cost in quality was not measured".to_owned(),
+    })
+}
+
+fn poses_left_out(config: &RunConfig) -> Option<LeftOut> {
+    let PoseSource::Tracks(errors) = config.resolved.poses_from else { return None };
+    (!config.resolved.refines_poses).then(|| LeftOut {
+        what: "refinement of poses".to_owned(),
+        evidence: format!(
+            "judged by {} points, the poses of {} views are off by {:.2} px (rms)",
+            errors.tracks, errors.views, errors.motion
         ),
         loss: "the cost in quality was not measured".to_owned(),
     })

@@ -74,6 +74,16 @@ impl Session<'_> {
                 ));
             }
         }
+        if let Some(poses) = &trainer.progress().poses {
+            let given = |view| trainer.views().camera(view);
+            let [turned, moved] = poses.rms(given);
+            let extent = self.run.dataset.extent();
+            self.observer.say(format_args!(
+                "poses    moved by {:.3} degrees and {:.2} % of the extent (rms); cameras.json has them",
+                turned.to_degrees(),
+                100.0 * moved / extent
+            ));
+        }
         self.observer.say(format_args!(
             "rows     {}, peak {}, budget {}",
             grouped(trainer.rows()),

@@ -30,3 +30,14 @@ pub enum PoseChoice {
     /// Poses are refined during training
     Refine,
 }
+
+impl PoseChoice {
+    /// The name in options.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Fixed => "fixed",
+            Self::Auto => "auto",
+            Self::Refine => "refine",
+        }
+    }
+}

@@ -32,6 +32,7 @@ mod neutral_options;
 mod photographing;
 #[cfg(unix)]
 mod posing;
+mod refining_poses;
 mod remote;
 mod reporting;
 mod resuming;

@@ -18,6 +18,7 @@ use densify_core::colour::ColourGradient;
 use densify_core::gaussians::ModelArray;
 use densify_core::image::{Image8, SharedImage};
 use densify_core::memory::Ledger;
+use densify_core::pose::PoseGradient;
 use densify_data::views::ViewError;
 use densify_render::{
     AuxInput, AuxOutput, BackendError, NonFinite, NumberKind, Rendering, StateArray, StateError,
@@ -87,8 +88,12 @@ impl Backend for CountingBackend {
         }
         let gradient = ColourGradient { matrix: [[1.0; 3]; 3], offset: [0.0; 3] };
         let exposure = input.exposure.map(|_| gradient);
+        if input.pose {
+            note(&self.log, format!("camera at {:.6}", input.camera.translation.y));
+        }
+        let pose = input.pose.then(|| PoseGradient { translation: DVec3::Y, ..Default::default() });
         let loss = if input.step == self.nan_loss_at { f32::NAN } else { 0.5 };
-        Ok(StepOutput { loss, exposure, ..StepOutput::default() })
+        Ok(StepOutput { loss, exposure, pose, ..StepOutput::default() })
     }
     fn observe(&mut self, input: &AuxInput<'_>) -> Result<AuxOutput, BackendError> {
         let (x, degree) = (input.camera.translation.x, input.sh_degree);

@@ -2,6 +2,7 @@
 
 use super::*;
 use crate::exposure::ExposureModel;
+use crate::poses::ExpectedErrors;
 
 #[test]
 fn every_epoch_shows_every_view_once_and_prefetches() {
@@ -52,6 +53,35 @@ fn exposures_belong_to_views() {
     let (mut without, ..) = trainer(&case);
     let refused = without.resume(state).unwrap_err().to_string();
     assert!(refused.contains("exposures"), "{refused}");
+}
+
+/// Each view has its own pose, which moves in the steps of this view, is what later steps see, and is saved in checkpoints.
+#[test]
+fn poses_belong_to_views() {
+    let case = Case { every: 100, ..CASE };
+    let (new, log, _) = trainer(&case);
+    let given: Vec<Camera> = (0..3).map(|view| *new.views().camera(view)).collect();
+    let initial = || Some(Poses::new(&given, &given, 9, 1.1, ExpectedErrors::default()));
+    let mut new = new.with_poses(initial());
+    (0..8).for_each(|_| _ = new.step().unwrap());
+    let log = log.lock().unwrap().clone();
+    let seen: Vec<f64> = log
+        .iter()
+        .filter_map(|line| line.strip_prefix("camera at "))
+        .map(|y| y.parse().unwrap())
+        .collect();
+    // Poses rest in the first quarter of the run, two steps.
+    assert_eq!(seen[..3], [given[0].translation.y; 3]);
+    assert!(seen[6..].iter().any(|y| (y - given[0].translation.y).abs() > 1e-5), "{seen:?}");
+    let state = new.state().unwrap();
+    let (resumed, ..) = trainer(&case);
+    let mut resumed = resumed.with_poses(initial());
+    resumed.resume(state.clone()).unwrap();
+    assert_eq!(resumed.progress().poses, new.progress().poses);
+    assert_eq!(resumed.camera(1), new.camera(1));
+    let (mut without, ..) = trainer(&case);
+    let refused = without.resume(state).unwrap_err().to_string();
+    assert!(refused.contains("poses"), "{refused}");
 }
 
 #[test]
