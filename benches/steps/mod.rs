@@ -70,6 +70,7 @@ pub(crate) fn input<'a>(step: u32, camera: &'a Camera, target: &'a Image8) -> St
         target,
         background: [0.0; 3],
         exposure: None,
+        vignette: None,
         depth: None,
         distortion: 0.0,
         sh_degree: 3,

@@ -54,6 +54,7 @@ TYPES = {
     "knob": "Mapping[str, Any]",
     "exposure": "str",
     "exposure_model": "str",
+    "vignette": "str",
     "on_nan": "str",
     "deterministic": "bool",
     "backend": "str",

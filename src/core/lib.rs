@@ -16,3 +16,4 @@ pub mod pieces;
 pub mod sh;
 pub mod spelling;
 pub mod spline;
+pub mod vignette;

@@ -41,6 +41,7 @@ use densify_core::gaussians::{Gaussians, ModelArray};
 use densify_core::image::Image8;
 use densify_core::image::depth::DepthMap;
 use densify_core::memory::Ledger;
+use densify_core::vignette::{COEFFICIENTS, Vignette};
 pub use densify_shaders::Accumulation;
 pub use depth::{DepthTarget, DepthTerm};
 pub use differentiable::{Differentiable, ImageGradient};
@@ -88,6 +89,9 @@ pub struct StepInput<'a> {
     /// The exposure of the photograph; requires a backend [set up](Setup::exposures) for exposures. The loss compares
     /// the photograph with the rendering after this transform, which keeps the background unchanged.
     pub exposure: Option<&'a ColourTransform>,
+    /// The vignette of the photograph, which follows the exposure; requires a backend [set up](Setup::vignettes) for
+    /// vignettes. It dims the background only where the photograph is opaque.
+    pub vignette: Option<&'a Vignette>,
     /// Given depth of the view; requires a backend [set up](Setup::depth) for depth.
     pub depth: Option<DepthTarget<'a>>,
     /// Weight λ of the distortion term, λ/N·Σ w·(x/X − 1)² over pixels and Gaussians, where x is a Gaussian's inverse
@@ -125,6 +129,8 @@ pub struct AuxInput<'a> {
     pub background: [f32; 3],
     /// See [`StepInput::exposure`].
     pub exposure: Option<&'a ColourTransform>,
+    /// See [`StepInput::vignette`].
+    pub vignette: Option<&'a Vignette>,
     /// Spherical-harmonic degree to evaluate, <= the model's.
     pub sh_degree: u8,
     /// The given depth of the view, of the camera's size, if the run trains on depth.
@@ -138,8 +144,20 @@ impl<'a> AuxInput<'a> {
     /// target, an image of the camera's size.
     pub fn of_rows(camera: &'a Camera, target: &'a Image8, request: &'a AuxRequest) -> Self {
         let (step, view, seed, sh_degree) = (0, 0, 0, 0);
-        let (background, exposure, depth) = ([0.0; 3], None, None);
-        Self { step, view, seed, camera, target, background, exposure, sh_degree, depth, request }
+        let (background, exposure, vignette, depth) = ([0.0; 3], None, None, None);
+        Self {
+            step,
+            view,
+            seed,
+            camera,
+            target,
+            background,
+            exposure,
+            vignette,
+            sh_degree,
+            depth,
+            request,
+        }
     }
 }
 
@@ -171,6 +189,8 @@ pub struct StepOutput {
     pub bands: u32,
     /// Gradient of the loss with respect to the exposure, if there is one.
     pub exposure: Option<ColourGradient>,
+    /// Gradient of the loss with respect to the coefficients of the vignette, if there is one.
+    pub vignette: Option<[f32; COEFFICIENTS]>,
     /// The [depth term](DepthTerm) without its weight, if depth is given.
     pub depth: Option<f32>,
 }

@@ -35,6 +35,8 @@ pub struct Setup {
     pub needs: Needs,
     /// True if steps and [observed](crate::Backend::observe) views may have exposures.
     pub exposures: bool,
+    /// True if steps and [observed](crate::Backend::observe) views may have vignettes.
+    pub vignettes: bool,
     /// True if steps may have given depth or a distortion term.
     pub depth: bool,
     /// True if the backend only renders, and so needs no memory for training (native backend).
@@ -57,6 +59,7 @@ impl Setup {
             shortcuts: Shortcuts::default(),
             needs: Needs::default(),
             exposures: false,
+            vignettes: false,
             depth: false,
             only_renders: false,
         }

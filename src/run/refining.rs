@@ -14,6 +14,7 @@ use densify_render::{Backend, Rendering};
 use densify_train::evaluate::Split;
 use densify_train::exposure::{ExposureChoice, ExposureModel, fitted};
 use densify_train::metrics::psnr;
+use densify_train::vignette::VignetteChoice;
 
 use crate::failure::Failure;
 use crate::finished::views_of;
@@ -44,6 +45,8 @@ pub struct TrainedModel {
     pub depth: DepthSpec,
     /// Exposure model, if the model was trained with an exposure per photograph.
     pub exposure: Option<ExposureModel>,
+    /// True if the model was trained with a vignette per camera.
+    pub vignette: bool,
     /// Near plane, as a fraction of the scene's extent; `None`: the usual near plane of the dataset.
     pub near: Option<Fraction>,
 }
@@ -95,14 +98,15 @@ impl TrainedModel {
                 ))
             })?;
             let (data, depth, near) = given;
-            return Ok(Self { file, scene, data, depth, exposure: None, near });
+            return Ok(Self { file, scene, data, depth, exposure: None, vignette: false, near });
         }
         let config = RunConfig::read(model)?;
         let scene = scene.unwrap_or_else(|| config.scene_path());
         let exposure = config.resolved.has_exposures;
         let exposure = exposure.then_some(config.spec.schedule.exposure_model);
+        let vignette = config.resolved.has_vignettes;
         let RunSpec { data, depth, start, .. } = config.spec;
-        Ok(Self { file, scene, data, depth, exposure, near: start.near })
+        Ok(Self { file, scene, data, depth, exposure, vignette, near: start.near })
     }
 
     /// Describes the run that trains `model`, which is or will be saved in `scratch`.
@@ -139,6 +143,9 @@ impl TrainedModel {
         if let Some(exposure_model) = self.exposure {
             spec.schedule.exposure = ExposureChoice::On;
             spec.schedule.exposure_model = exposure_model;
+        }
+        if self.vignette {
+            spec.schedule.vignette = VignetteChoice::On;
         }
         spec.output.coordinates =
             if model.is_local() { Coordinates::Local } else { Coordinates::World };

@@ -12,3 +12,4 @@ pub mod output;
 pub mod pictures;
 pub mod schedule;
 pub mod trainer;
+pub mod vignette;

@@ -159,6 +159,7 @@ pub(crate) fn step_input<'a>(
         target,
         background: BLUE,
         exposure: None,
+        vignette: None,
         depth: None,
         distortion: 0.0,
         sh_degree,

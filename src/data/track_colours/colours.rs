@@ -20,9 +20,9 @@ pub(super) struct Observation {
     /// Colour at the point.
     pub(super) centre: [u8; 3],
     /// Smallest values of the pixel at the point and of its neighbours.
-    lowest: [u8; 3],
+    pub(super) lowest: [u8; 3],
     /// Largest values of these pixels.
-    highest: [u8; 3],
+    pub(super) highest: [u8; 3],
 }
 
 /// Peak memory for reading and measuring the colours of tracks, in addition to an image `[bytes]`.

@@ -103,6 +103,7 @@ fn run(
             target,
             background: BACKGROUND,
             exposure: None,
+            vignette: None,
             depth: map.map(|map| {
                 let term = if step == 1 { DepthTerm::Expected } else { DepthTerm::Samples };
                 DepthTarget { map, weight: 1.0, term }

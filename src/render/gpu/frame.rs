@@ -66,6 +66,7 @@ impl State {
             entries: self.entries(),
             bands,
             exposure: None,
+            vignette: None,
             depth: None,
         }
     }

@@ -33,6 +33,7 @@ mod state;
 mod step;
 mod submit;
 mod transfer;
+mod vignette;
 
 use std::collections::HashMap;
 use std::ops::Range;
@@ -109,6 +110,8 @@ pub struct GpuBackend {
     photographs: HashMap<usize, ResidentPhotograph>,
     /// Derivative sums of the last step's exposure, if it had one; see `shaders/exposure.wgsl`.
     exposure_sums: [[f32; 4]; 4],
+    /// The same of its vignette; see `shaders/vignette.wgsl`.
+    vignette_sums: [f32; 4],
     /// Number of bands to encode for the next view.
     bands: u32,
     stage_times: Vec<(&'static str, Duration)>,
@@ -158,6 +161,7 @@ impl GpuBackend {
             candidates: Candidates::new(options.needs.candidates),
             photographs: HashMap::new(),
             exposure_sums: [[0.0; 4]; 4],
+            vignette_sums: [0.0; 4],
             bands: 1,
             stage_times: Vec::new(),
         };

@@ -3,9 +3,9 @@
 use densify_policies::policy::{Cadence, ErrorMode, Needs, PixelLoss};
 use wgpu::BufferUsages;
 
-use super::exposure;
 use super::frame::{Frame, State, grid};
 use super::rows::{Content, Narrow, RowArray, row_arrays};
+use super::{exposure, vignette};
 use crate::Accumulation;
 use crate::cpu::BiasCorrection;
 use crate::signals::{Field, RecordLayout, SignalPlanes, counts_dominant};
@@ -74,8 +74,10 @@ pub(super) struct Sizes {
     pub(super) with_error: bool,
     /// True if pixels at edges have more weight.
     pub(super) with_edges: bool,
-    /// True if photographs have exposures.
+    /// True if photographs have exposures; vignettes need them, too.
     pub(super) exposures: bool,
+    /// True if photographs have vignettes.
+    pub(super) vignettes: bool,
     /// True if depth may be in the loss.
     pub(super) depth: bool,
 }
@@ -137,6 +139,7 @@ impl Sizes {
             with_error: records.has(Field::Error)
                 && needs.candidates.is_some_and(|r| r.error != ErrorMode::Gradient),
             exposures: false,
+            vignettes: false,
             depth,
         }
     }
@@ -290,6 +293,12 @@ impl Sizes {
             let sums = exposure::SUMS * exposure::groups(pixels);
             add(Section::Renderer, "exposure", "exposure sums", sums);
             add(Section::Renderer, "exposure", "exposure total", exposure::SUMS);
+        }
+        if self.vignettes {
+            add(Section::Renderer, "vignette", "vignette", vignette::PARAMETERS);
+            let sums = vignette::SUMS * exposure::groups(pixels);
+            add(Section::Renderer, "vignette", "vignette sums", sums);
+            add(Section::Renderer, "vignette", "vignette total", vignette::SUMS);
         }
         add(Section::Images, "photograph on the device", "truth", 4 * pixels);
         add(Section::Images, "photograph on the device", "mask", pixels.next_multiple_of(4));

@@ -34,7 +34,7 @@ impl GpuBackend {
 
     /// Forward pass, loss, backward pass and optimiser.
     pub(super) fn step(&mut self, input: &StepInput<'_>) -> Result<StepOutput, BackendError> {
-        let StepInput { camera, target, background, exposure, .. } = *input;
+        let StepInput { camera, target, background, exposure, vignette, .. } = *input;
         assert_same_size(camera, target);
         let start = Instant::now();
         if self.sizes.alpha_and_depth {
@@ -45,7 +45,7 @@ impl GpuBackend {
         let (due, waiting) = self.cadence_bits(input);
         let mut frame = self.frame(camera, background, input.sh_degree);
         frame.draw[3] = self.load_photograph(input.view, target);
-        self.load_exposure(&mut frame, exposure);
+        let is_exposed = self.load_camera(&mut frame, exposure, vignette);
         let depth = self.load_depth(&mut frame, input);
         let trained = self.sizes.budget.trained(self.rows).max(1) as f32;
         frame.add_step(input, trained, due, &self.planes);
@@ -75,11 +75,17 @@ impl GpuBackend {
                 let numbers = [distortion, least_inverse, weight, by_transmittance];
                 passes.depth_gradient(to, pixels, numbers);
             }
-            if exposure.is_some() {
+            if is_exposed {
                 passes.expose(to, pixels);
             }
-            passes.loss(to, exposure.is_some(), true);
-            if exposure.is_some() {
+            if vignette.is_some() {
+                passes.dim(to, pixels);
+            }
+            passes.loss(to, is_exposed, true);
+            if vignette.is_some() {
+                passes.dim_bwd(to, pixels);
+            }
+            if is_exposed {
                 passes.expose_bwd(to, pixels);
             }
         };
@@ -117,7 +123,8 @@ impl GpuBackend {
             self.stage_times = vec![("device", start.elapsed())];
         }
         let exposure = exposure.map(|exposure| self.exposure_gradient(exposure, background));
+        let vignette = vignette.map(|_| self.vignette_gradient());
         let given = input.depth.map(|_| state.depth);
-        Ok(StepOutput { exposure, depth: given, ..state.output() })
+        Ok(StepOutput { exposure, vignette, depth: given, ..state.output() })
     }
 }

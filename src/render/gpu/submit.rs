@@ -1,9 +1,8 @@
 //! Submits a view's passes, and repeats them with more bands if there were too few.
 
-use super::exposure::SUMS;
 use super::frame::{Frame, State};
 use super::passes::{Passes, Recorder, Shape};
-use super::{GpuBackend, readback};
+use super::{GpuBackend, exposure, readback, vignette};
 use crate::BackendError;
 
 impl GpuBackend {
@@ -32,16 +31,26 @@ impl GpuBackend {
             let staging = self.buffers.get("read");
             let state_bytes = size_of::<State>() as u64;
             encoder.copy_buffer_to_buffer(self.buffers.get("state"), 0, staging, 0, state_bytes);
-            let sums_bytes = if self.sizes.exposures { SUMS } else { 0 };
-            if sums_bytes > 0 {
-                let sums = self.buffers.get("exposure total");
-                encoder.copy_buffer_to_buffer(sums, 0, staging, state_bytes, sums_bytes);
+            let mut end = state_bytes;
+            for (is_there, name, bytes) in [
+                (self.sizes.exposures, "exposure total", exposure::SUMS),
+                (self.sizes.vignettes, "vignette total", vignette::SUMS),
+            ] {
+                if is_there {
+                    let sums = self.buffers.get(name);
+                    encoder.copy_buffer_to_buffer(sums, 0, staging, end, bytes);
+                    end += bytes;
+                }
             }
-            let bytes = readback::finish(&self.device, staging, encoder, state_bytes + sums_bytes)?;
+            let bytes = readback::finish(&self.device, staging, encoder, end)?;
             let (state, sums) = bytes.split_at(size_of::<State>());
             let state: State = bytemuck::pod_read_unaligned(state);
-            if sums_bytes > 0 {
-                self.exposure_sums = bytemuck::pod_read_unaligned(sums);
+            if self.sizes.exposures {
+                let (of_exposure, of_vignette) = sums.split_at(exposure::SUMS as usize);
+                self.exposure_sums = bytemuck::pod_read_unaligned(of_exposure);
+                if self.sizes.vignettes {
+                    self.vignette_sums = bytemuck::pod_read_unaligned(of_vignette);
+                }
             }
             if state.broken_off != 0 {
                 return Err(BackendError::LoopCut {

@@ -12,6 +12,7 @@ use super::exposure::Exposure;
 use super::fit::RunSize;
 use super::inputs::{Evidence, Inputs, Reading, choose_moments, open_device};
 use super::size::MIN_ROWS;
+use super::vignette::CameraVignettes;
 use crate::failure::{Failure, ModelProblem, OptionProblem, SizeProblem};
 use crate::host::Host;
 use crate::near_plane::NearPlane;
@@ -25,6 +26,7 @@ use densify_core::spelling::Spelling;
 use densify_train::exposure::ExposureChoice;
 use densify_train::schedule::Background;
 use densify_train::trainer::{AutoChoices, FLOATER_BYTES, floater_request, growth_signals};
+use densify_train::vignette::VignetteChoice;
 
 /// Maximum number of random initial points without `--init-points` (Kerbl et al. 2023 use 100,000).
 const RANDOM_POINTS: usize = 100_000;
@@ -53,6 +55,7 @@ pub(crate) struct Choices {
     pub(crate) knobs: Knobs,
     pub(crate) degree: Degree,
     pub(crate) exposure: Exposure,
+    pub(crate) vignette: CameraVignettes,
     pub(crate) antialiasing: Antialiasing,
     pub(crate) near: NearPlane,
     pub(crate) position_rates: PositionRates,
@@ -77,7 +80,8 @@ impl Choices {
     /// Messages about the choices that depend on the scene.
     pub(super) fn lines(&self, spelling: Spelling) -> impl Iterator<Item = String> {
         let depths = self.near.line(spelling).into_iter().chain(self.position_rates.line());
-        depths.chain(self.degree.line()).chain(self.exposure.line(spelling))
+        let light = self.exposure.line(spelling).into_iter().chain(self.vignette.line(spelling));
+        depths.chain(self.degree.line()).chain(light)
     }
 }
 
@@ -85,15 +89,20 @@ impl<'a> Case<'a> {
     /// A new run.
     pub(super) fn for_new_run(spec: &'a RunSpec, host: Host<'_>) -> Result<Self, Failure> {
         let may_learn_exposures = spec.schedule.exposure != ExposureChoice::Off;
+        let may_learn_vignettes = spec.schedule.vignette != VignetteChoice::Off;
         let reading = Reading {
-            tracks: spec.size.sh_degree == Some(ShDegree::Auto(None)) || may_learn_exposures,
+            tracks: spec.size.sh_degree == Some(ShDegree::Auto(None))
+                || may_learn_exposures
+                || may_learn_vignettes,
             colours: true,
             exif: may_learn_exposures,
+            vignettes: may_learn_vignettes,
             ..Reading::default()
         };
         Self::open(spec, &reading, host, |evidence| {
             let degree = Degree::decide(spec, None, evidence);
-            (degree, Exposure::decide(spec, evidence))
+            let exposure = Exposure::decide(spec, evidence);
+            (degree, exposure, CameraVignettes::decide(spec, evidence))
         })
     }
 
@@ -105,13 +114,15 @@ impl<'a> Case<'a> {
         host: Host<'_>,
     ) -> Result<Self, Failure> {
         let decides_exposures = spec.schedule.exposure != ExposureChoice::Off && !has_checkpoint;
+        let decides_vignettes = spec.schedule.vignette != VignetteChoice::Off && !has_checkpoint;
         let findings = &saved.resolved;
         let reading = Reading {
             // A checkpoint contains the rows of both models, so their files may no longer exist.
             models: Some([findings.init_model, findings.frozen]),
-            tracks: decides_exposures,
+            tracks: decides_exposures || decides_vignettes,
             colours: true,
             exif: decides_exposures,
+            vignettes: decides_vignettes,
             depth: Some(findings.depth.is_some()),
             tolerance: RESUME_TOLERANCE,
         };
@@ -122,7 +133,12 @@ impl<'a> Case<'a> {
             } else {
                 Exposure::decide(spec, evidence)
             };
-            (degree, exposure)
+            let vignette = if has_checkpoint {
+                CameraVignettes::known(findings.has_vignettes, findings.vignette_from)
+            } else {
+                CameraVignettes::decide(spec, evidence)
+            };
+            (degree, exposure, vignette)
         })
     }
 
@@ -133,10 +149,17 @@ impl<'a> Case<'a> {
         host: Host<'_>,
     ) -> Result<Self, Failure> {
         let has_exposures = spec.schedule.exposure != ExposureChoice::Off;
-        let reading = Reading { models: Some(models), tracks: has_exposures, ..Reading::default() };
+        let has_vignettes = spec.schedule.vignette != VignetteChoice::Off;
+        let reading = Reading {
+            models: Some(models),
+            tracks: has_exposures || has_vignettes,
+            vignettes: has_vignettes,
+            ..Reading::default()
+        };
         let mut case = Self::open(spec, &reading, host, |evidence| {
             let exposure = Exposure::known(has_exposures, super::ExposureSource::Given);
-            (Degree::decide(spec, None, evidence), exposure)
+            let vignette = CameraVignettes::known(has_vignettes, super::VignetteSource::Given);
+            (Degree::decide(spec, None, evidence), exposure, vignette)
         })?;
         if case.inputs.device.adapter().is_none() {
             // The run will be another process, so what this one holds counts only if it includes a driver's kernels.
@@ -149,14 +172,15 @@ impl<'a> Case<'a> {
         spec: &'a RunSpec,
         reading: &Reading,
         host: Host<'_>,
-        decide: impl FnOnce(&Evidence) -> (Degree, Exposure),
+        decide: impl FnOnce(&Evidence) -> (Degree, Exposure, CameraVignettes),
     ) -> Result<Self, Failure> {
         let (entry, parameters) = spec.policy()?;
         let mut knobs = spec.knobs()?;
         check_automatic(spec)?;
         let device = open_device(spec, &mut knobs, host.observer)?;
         let (inputs, evidence) = Inputs::open(spec, device, reading, host)?;
-        let (degree, exposure) = decide(&evidence);
+        let (degree, exposure, vignette) = decide(&evidence);
+        vignette.check(&inputs.dataset)?;
         drop(evidence);
         for note in &exposure.notes {
             host.observer.say(format_args!("note: {note}"));
@@ -174,6 +198,7 @@ impl<'a> Case<'a> {
             knobs,
             degree,
             exposure,
+            vignette,
             antialiasing: antialiasing(spec, &inputs)?,
             near: NearPlane::from_depths(spec.start.near, &seen),
             position_rates: PositionRates::choose(spec, &seen),

@@ -18,6 +18,7 @@ use densify_core::files::{FileError, write_atomically};
 use densify_data::dataset::{DepthFinding, is_archive};
 use densify_data::track_colours::Spread;
 use densify_data::track_colours::exposures::ExposureSpread;
+use densify_data::track_colours::vignettes::VignetteSpread;
 use densify_train::output::{CONFIG_FILE, FolderError};
 
 /// A resolved run as stored in its `config.toml`.
@@ -59,6 +60,12 @@ pub struct Findings {
     pub exposure_from: ExposureSource,
     /// True if exposures are learned.
     pub has_exposures: bool,
+    /// The reason for learning vignettes or not.
+    #[serde(skip_serializing_if = "VignetteSource::is_given")]
+    pub vignette_from: VignetteSource,
+    /// True if vignettes are learned.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub has_vignettes: bool,
     /// The model that the run started from.
     pub init_model: Option<ModelSize>,
     /// The model whose Gaussians never change.
@@ -101,6 +108,26 @@ pub enum ExposureSource {
     Tracks(ExposureSpread),
     /// No evidence: too few tracks are known, so exposures are not learned.
     Undecided,
+}
+
+/// The reason for learning a vignette for each camera, or not.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum VignetteSource {
+    /// The options.
+    #[default]
+    Given,
+    /// The colours of tracks, before training, of the camera with the clearest evidence.
+    Tracks(VignetteSpread),
+    /// No evidence: too few tracks are seen at different radii, so vignettes are not learned.
+    Undecided,
+}
+
+impl VignetteSource {
+    /// True if the options decided.
+    pub fn is_given(&self) -> bool {
+        *self == Self::Given
+    }
 }
 
 /// The reason for the spherical-harmonic degree of a run.
@@ -176,6 +203,8 @@ impl RunConfig {
             sh_degree_lowered: *degree_lowered,
             exposure_from: choices.exposure.source,
             has_exposures: choices.exposure.is_on,
+            vignette_from: choices.vignette.source,
+            has_vignettes: choices.vignette.is_on,
             init_model: inputs.init_model,
             frozen: inputs.frozen_model,
             depth: inputs.dataset.depth.clone(),

@@ -7,7 +7,8 @@ use crate::observer::{Observer, say_notes};
 use crate::spec::knobs::Knobs;
 use crate::spec::{AbsolutePath, InitChoice, RunSpec, StartSpec};
 use densify_data::dataset::images::ImageDemand;
-use densify_data::dataset::{Dataset, ReportedExposures, Tracks, View};
+use densify_data::dataset::{Dataset, ReportedExposures, Tracks, View, cameras_of};
+use densify_data::track_colours::vignettes::{self, VignetteSpread};
 use densify_data::track_colours::{self, MIN_TRACKS, TrackColours};
 use densify_render::{Accumulation, BackendKind, Device};
 use densify_train::init::usable_points;
@@ -49,6 +50,10 @@ pub(super) struct Evidence {
     pub(super) colours: Option<TrackColours>,
     /// Exposures in EXIF.
     pub(super) reported: ReportedExposures,
+    /// Vignettes of the cameras by the colours of tracks; empty if they were not measured.
+    pub(super) vignettes: Vec<VignetteSpread>,
+    /// Name of a view that is one of several of its photograph, for which vignettes cannot be learned.
+    pub(super) divided: Option<String>,
 }
 
 /// The evidence to read in addition to the dataset, and the sizes of models if they are known.
@@ -62,6 +67,8 @@ pub(super) struct Reading {
     pub(super) colours: bool,
     /// Read the exposures in EXIF.
     pub(super) exif: bool,
+    /// Measure the vignettes of the cameras.
+    pub(super) vignettes: bool,
     /// The decision about depth that an earlier session of the run has taken.
     pub(super) depth: Option<bool>,
     /// Resident memory that is not counted `[bytes]`, so that a resumed run is not refused because its process takes a
@@ -104,8 +111,19 @@ impl Inputs {
         let has_colours = reading.colours && tracks.count() >= MIN_TRACKS;
         let colours =
             has_colours.then(|| TrackColours::read(&tracks, &dataset.train)).transpose()?;
-        let track_bytes =
+        let mut track_bytes =
             if reading.tracks { tracks.bytes() + track_colours::bytes(&tracks) } else { 0 };
+        let (mut measured, mut divided) = (Vec::new(), None);
+        if reading.vignettes {
+            track_bytes += vignettes::bytes(&tracks);
+            let views = &dataset.train;
+            let places: Vec<_> = views.iter().map(View::place_in_photograph).collect();
+            let found = views.iter().zip(&places).find(|(_, place)| place.is_none());
+            divided = found.map(|(view, _)| view.name.clone());
+            if let Some(colours) = &colours {
+                measured = vignettes::measure(&tracks, colours, views, &cameras_of(views), &places);
+            }
+        }
         let reported = reading.exif.then(|| ReportedExposures::read(&dataset.train));
         let reported = reported.unwrap_or_default();
         let inputs = Self {
@@ -122,7 +140,7 @@ impl Inputs {
             peak,
             companion: host.companion,
         };
-        Ok((inputs, Evidence { tracks, colours, reported }))
+        Ok((inputs, Evidence { tracks, colours, reported, vignettes: measured, divided }))
     }
 
     /// The same inputs with the photographs at the resolution of `spec`.

@@ -21,6 +21,7 @@ use densify_render::{KeptPhotographs, MomentStorage, Setup, Shortcuts, Storage};
 use densify_train::exposure::Exposures;
 use densify_train::metrics::{geometry, scratch_bytes};
 use densify_train::trainer::AutoChoices;
+use densify_train::vignette::Vignettes;
 
 /// Memory of the program itself `[bytes]`: the code pages in use, and the stacks of its threads. Measured at 15 to 17
 /// MiB, and at up to 20 MiB in builds for tests (profile `dev`): it varies with what the system has mapped already.
@@ -61,6 +62,7 @@ impl Case<'_> {
             shortcuts: self.choices.knobs.shortcuts,
             needs,
             exposures: self.choices.exposure.is_on,
+            vignettes: self.choices.vignette.is_on,
             depth: self.has_depth(),
             ..Setup::default()
         }
@@ -118,6 +120,14 @@ impl Case<'_> {
         if exposures > 0 {
             ledger.add_to(Section::Model, "exposures of the views", exposures);
         }
+        let vignettes = if self.choices.vignette.is_on {
+            Vignettes::bytes(self.inputs.dataset.train.len())
+        } else {
+            0
+        };
+        if vignettes > 0 {
+            ledger.add_to(Section::Model, "vignettes of the cameras", vignettes);
+        }
         if self.inputs.track_bytes > 0 {
             let bytes = self.inputs.track_bytes + train.held(0) + train.decoding(1);
             ledger.add_to(Section::Before, "colours of tracks", bytes);
@@ -148,7 +158,8 @@ impl Case<'_> {
                 ..Frame::WORLD
             },
         });
-        pass("export of the model, checkpoint", 2 * piece * row + held + EXPOSURE_TEXT * exposures);
+        let text = EXPOSURE_TEXT * (exposures + vignettes);
+        pass("export of the model, checkpoint", 2 * piece * row + held + text);
         if let Some(companion) = self.inputs.companion {
             let sizes = CompanionSize {
                 budget,

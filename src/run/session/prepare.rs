@@ -86,6 +86,7 @@ pub(super) fn prepare(
     let options = train_options(&run, training.rates);
     let ResolvedRun { case, size, .. } = run;
     let exposures = case.choices.exposure.initial(spec, &case.inputs.dataset);
+    let vignettes = case.choices.vignette.initial(&case.inputs.dataset);
     let (name, automatic) = (case.choices.entry.name, case.choices.automatic);
     let mut dataset = case.inputs.into_owned().dataset;
     let views = DatasetViews::new(dataset.train.clone(), size.image_cache, DECODERS);
@@ -96,7 +97,8 @@ pub(super) fn prepare(
         .map_or_else(PointCloud::default, |companion| dataset.points.thinned(companion.points));
     let ResolvedTraining { policy, scene, .. } = training;
     let trainer = Trainer::new(views, backend, (name, policy), scene, options)?;
-    let mut trainer = trainer.with_auto_choices(automatic).with_exposures(exposures);
+    let trainer = trainer.with_auto_choices(automatic).with_exposures(exposures);
+    let mut trainer = trainer.with_vignettes(vignettes);
     let session = match resumed {
         Some(resumed) => resume::restore(resumed, &mut trainer, observer)?,
         None => None,

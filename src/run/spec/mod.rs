@@ -34,6 +34,7 @@ use densify_render::{BackendChoice, DepthTerm};
 use densify_train::exposure::{ExposureChoice, ExposureModel};
 use densify_train::schedule::{Background, InitRates, REFERENCE_ITERATIONS};
 use densify_train::trainer::{Annealed, OnNan};
+use densify_train::vignette::VignetteChoice;
 use values::as_table;
 
 /// Rule for changing an option of a resumed run.
@@ -338,6 +339,10 @@ run_spec! {
 
         /// Form of the learned exposures
         exposure_model: ExposureModel = ExposureModel::Channels, Fixed, value "MODEL";
+
+        /// Learn a vignette for each camera: the light that its photographs lose towards their edges. Test views are
+        /// measured without it. auto needs the tracks of a reconstruction
+        vignette: VignetteChoice = VignetteChoice::Off, Fixed, value "WHEN";
 
         /// Treatment of Gaussians with a non-finite value; the model is checked at least every 100 iterations
         on_nan: OnNan = OnNan::Prune, Free, value "ACTION";

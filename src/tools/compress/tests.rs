@@ -45,6 +45,7 @@ fn options<'a>(to: Target, scene: &Path, formats: &'a [&'static Format]) -> Opti
             data: DataSpec::default(),
             depth: DepthSpec::default(),
             exposure: None,
+            vignette: false,
             near: None,
         },
         antialias: None,

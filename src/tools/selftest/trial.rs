@@ -214,6 +214,7 @@ pub(super) fn step(
         target,
         background,
         exposure: None,
+        vignette: None,
         depth: None,
         distortion: 0.0,
         sh_degree,

@@ -165,6 +165,7 @@ fn a_signal_stops_between_any_two_views() {
             data: DataSpec { eval: true, ..DataSpec::default() },
             depth: DepthSpec::default(),
             exposure: None,
+            vignette: false,
             near: None,
         },
         antialias: None,
