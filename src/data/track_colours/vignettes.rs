@@ -54,6 +54,11 @@ impl VignetteSpread {
         is_enough.then_some(self.stops >= MIN_STOPS && self.stops >= MIN_SIGNIFICANCE * self.error)
     }
 
+    /// True if a vignette should be learned.
+    pub fn is_found(&self) -> bool {
+        self.decision() == Some(true)
+    }
+
     /// The coefficients of V that agree best with the loss.
     pub fn coefficients(&self) -> [f32; COEFFICIENTS] {
         polynomial(self.stops / CORNER)

@@ -7,14 +7,15 @@ use crate::observer::{Observer, say_notes};
 use crate::spec::knobs::Knobs;
 use crate::spec::{AbsolutePath, InitChoice, RunSpec, StartSpec};
 use densify_data::dataset::images::ImageDemand;
-use densify_data::dataset::{Dataset, ReportedExposures, Tracks, View, cameras_of};
-use densify_data::track_colours::vignettes::{self, VignetteSpread};
+use densify_data::dataset::{Dataset, ReportedExposures, Tracks, View};
+use densify_data::track_colours::vignettes;
 use densify_data::track_colours::{self, MIN_TRACKS, TrackColours};
 use densify_render::{Accumulation, BackendKind, Device};
 use densify_train::init::usable_points;
 
 use super::config::ModelSize;
 use super::models::{file_of, size_of_model};
+use super::vignette::VignetteEvidence;
 
 /// Everything that a run reads and runs on.
 #[derive(Clone)]
@@ -50,10 +51,8 @@ pub(super) struct Evidence {
     pub(super) colours: Option<TrackColours>,
     /// Exposures in EXIF.
     pub(super) reported: ReportedExposures,
-    /// Vignettes of the cameras by the colours of tracks; empty if they were not measured.
-    pub(super) vignettes: Vec<VignetteSpread>,
-    /// Name of a view that is one of several of its photograph, for which vignettes cannot be learned.
-    pub(super) divided: Option<String>,
+    /// Vignettes of the cameras.
+    pub(super) vignettes: VignetteEvidence,
 }
 
 /// The evidence to read in addition to the dataset, and the sizes of models if they are known.
@@ -109,20 +108,14 @@ impl Inputs {
         let peak = (host.process.peak)();
         let tracks = std::mem::take(&mut dataset.tracks);
         let has_colours = reading.colours && tracks.count() >= MIN_TRACKS;
-        let colours =
+        let mut colours =
             has_colours.then(|| TrackColours::read(&tracks, &dataset.train)).transpose()?;
         let mut track_bytes =
             if reading.tracks { tracks.bytes() + track_colours::bytes(&tracks) } else { 0 };
-        let (mut measured, mut divided) = (Vec::new(), None);
+        let mut of_vignettes = VignetteEvidence::default();
         if reading.vignettes {
             track_bytes += vignettes::bytes(&tracks);
-            let views = &dataset.train;
-            let places: Vec<_> = views.iter().map(View::place_in_photograph).collect();
-            let found = views.iter().zip(&places).find(|(_, place)| place.is_none());
-            divided = found.map(|(view, _)| view.name.clone());
-            if let Some(colours) = &colours {
-                measured = vignettes::measure(&tracks, colours, views, &cameras_of(views), &places);
-            }
+            of_vignettes = VignetteEvidence::measure(&tracks, colours.as_mut(), &dataset.train);
         }
         let reported = reading.exif.then(|| ReportedExposures::read(&dataset.train));
         let reported = reported.unwrap_or_default();
@@ -140,7 +133,7 @@ impl Inputs {
             peak,
             companion: host.companion,
         };
-        Ok((inputs, Evidence { tracks, colours, reported, vignettes: measured, divided }))
+        Ok((inputs, Evidence { tracks, colours, reported, vignettes: of_vignettes }))
     }
 
     /// The same inputs with the photographs at the resolution of `spec`.

@@ -6,11 +6,47 @@ use crate::failure::{Failure, OptionProblem, notes};
 use crate::spec::RunSpec;
 use densify_core::numbers::{counted, grouped};
 use densify_core::spelling::Spelling;
-use densify_core::vignette::COEFFICIENTS;
-use densify_data::dataset::{Dataset, View, cameras_of};
-use densify_data::track_colours::MIN_TRACKS;
-use densify_data::track_colours::vignettes::VignetteSpread;
+use densify_core::vignette::{COEFFICIENTS, PhotographPlace, Vignette};
+use densify_data::dataset::{Dataset, Tracks, View, cameras_of};
+use densify_data::track_colours::vignettes::{self, VignetteSpread};
+use densify_data::track_colours::{MIN_TRACKS, TrackColours};
 use densify_train::vignette::{VignetteChoice, Vignettes};
+
+/// The evidence for vignettes.
+#[derive(Debug, Clone, Default)]
+pub(super) struct VignetteEvidence {
+    /// The vignette of each camera by the colours of tracks; empty if they were not measured.
+    cameras: Vec<VignetteSpread>,
+    /// Name of a view that is one of several of its photograph, for which vignettes cannot be learned.
+    divided: Option<String>,
+}
+
+impl VignetteEvidence {
+    /// Measures the vignettes of the cameras, and removes those that are found from the colours, so that other choices
+    /// are not misled by them.
+    pub(super) fn measure(
+        tracks: &Tracks,
+        colours: Option<&mut TrackColours>,
+        views: &[View],
+    ) -> Self {
+        let places: Vec<_> = views.iter().map(View::place_in_photograph).collect();
+        let divided = views.iter().zip(&places).find(|(_, place)| place.is_none());
+        let divided = divided.map(|(view, _)| view.name.clone());
+        let Some(colours) = colours else { return Self { cameras: Vec::new(), divided } };
+        let numbers = cameras_of(views);
+        let cameras = vignettes::measure(tracks, colours, views, &numbers, &places);
+        if divided.is_none() && cameras.iter().any(VignetteSpread::is_found) {
+            let of_view = |(camera, place): (&u32, &Option<PhotographPlace>)| {
+                let found = cameras[*camera as usize];
+                let coefficients = found.is_found().then(|| found.coefficients())?;
+                Some(Vignette { coefficients, place: (*place)? })
+            };
+            let found: Vec<_> = numbers.iter().zip(&places).map(of_view).collect();
+            colours.undo_vignettes(tracks, views, &found);
+        }
+        Self { cameras, divided }
+    }
+}
 
 /// The vignettes of a run.
 #[derive(Debug, Clone)]
@@ -34,16 +70,15 @@ impl CameraVignettes {
 
     /// Decides by the option, or with `auto` by the colours of tracks, which also give the vignettes to start with.
     pub(super) fn decide(spec: &RunSpec, evidence: &Evidence) -> Self {
-        let spreads = &evidence.vignettes;
-        let found = |spread: &&VignetteSpread| spread.decision() == Some(true);
+        let VignetteEvidence { cameras: spreads, divided } = &evidence.vignettes;
         let strength = |spread: &VignetteSpread| spread.stops / spread.error.max(1e-6);
         // The camera with the strongest evidence; if none decides anything, there is none.
         let strongest = spreads
             .iter()
             .filter(|spread| spread.decision().is_some())
             .max_by(|a, b| strength(a).total_cmp(&strength(b)));
-        let dimmed = spreads.iter().filter(found).count();
-        let divided = evidence.divided.clone();
+        let dimmed = spreads.iter().filter(|spread| spread.is_found()).count();
+        let divided = divided.clone();
         let (is_on, source) = match (spec.schedule.vignette, strongest) {
             (VignetteChoice::Off, _) => (false, VignetteSource::Given),
             (VignetteChoice::On, _) => (true, VignetteSource::Given),
@@ -54,7 +89,11 @@ impl CameraVignettes {
         };
         let start = spreads
             .iter()
-            .map(|spread| if found(&spread) { spread.coefficients() } else { [0.0; COEFFICIENTS] })
+            .map(
+                |spread| {
+                    if spread.is_found() { spread.coefficients() } else { [0.0; COEFFICIENTS] }
+                },
+            )
             .collect();
         let start = if is_on && dimmed > 0 { start } else { Vec::new() };
         Self { is_on, source, cameras: [spreads.len(), dimmed], start, divided }
@@ -128,7 +167,8 @@ mod tests {
     fn decided(choice: VignetteChoice, spreads: &[VignetteSpread]) -> CameraVignettes {
         let mut spec = RunSpec::default();
         spec.schedule.vignette = choice;
-        let evidence = Evidence { vignettes: spreads.to_vec(), ..Evidence::default() };
+        let vignettes = VignetteEvidence { cameras: spreads.to_vec(), divided: None };
+        let evidence = Evidence { vignettes, ..Evidence::default() };
         CameraVignettes::decide(&spec, &evidence)
     }
 

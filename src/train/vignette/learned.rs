@@ -63,7 +63,7 @@ impl Vignettes {
         views: impl Iterator<Item = (u32, PhotographPlace)>,
     ) -> Self {
         let camera = |&values: &[f32; COEFFICIENTS]| CameraVignette {
-            values: without_gain(values),
+            values: falling(values),
             first: [0.0; COEFFICIENTS],
             second: [0.0; COEFFICIENTS],
             age: 0,
@@ -124,7 +124,7 @@ impl Vignettes {
                 / ((camera.second[i] * second_scale).sqrt() + EPSILON);
             camera.values[i] -= rate * step / power;
         }
-        camera.values = without_gain(camera.values);
+        camera.values = falling(camera.values);
     }
 
     /// Checks that these saved vignettes are finite, and are those of the same views and cameras as `other`.
@@ -163,14 +163,39 @@ fn stops(values: [f32; COEFFICIENTS]) -> f64 {
     -f64::from(left).log2()
 }
 
-/// The coefficients with a₁ lowered so far that no pixel gets brighter. Without this, V could rise above 1, where its
-/// limit hides all derivatives.
-fn without_gain([a, b, c]: [f32; COEFFICIENTS]) -> [f32; COEFFICIENTS] {
-    // V − 1 = s·q(s), and q must not exceed 0 between 0 and the largest s.
-    let q = |s: f32| a + s * (b + s * c);
-    let middle = if c < 0.0 { (-b / (2.0 * c)).clamp(0.0, LARGEST) } else { 0.0 };
-    let largest = q(0.0).max(q(LARGEST)).max(q(middle));
-    [a - largest.max(0.0), b, c]
+/// The nearest coefficients, by their terms at the corner of a square, with which light falls from the middle to every
+/// corner. Otherwise V could rise above 1, where its limit hides all derivatives, or the holes of a model that has just
+/// begun could be explained by dark rings.
+fn falling(values: [f32; COEFFICIENTS]) -> [f32; COEFFICIENTS] {
+    /// Radii at which the slope is limited, and rounds over these limits.
+    const RADII: usize = 8;
+    const ROUNDS: usize = 100;
+    let powers = [1, 2, 3].map(|power| LARGEST.powi(power));
+    let mut terms: [f32; COEFFICIENTS] = std::array::from_fn(|i| values[i] * powers[i]);
+    // dV/dt, with t the share of the largest r².
+    let normal = |i: usize| {
+        let t = i as f32 / RADII as f32;
+        [1.0, 2.0 * t, 3.0 * t * t]
+    };
+    let dot =
+        |a: &[f32; COEFFICIENTS], b: &[f32; COEFFICIENTS]| a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+    if (0..=RADII).all(|i| dot(&normal(i), &terms) <= 0.0) {
+        return values;
+    }
+    // Hildreth's method finds the nearest point; without the multipliers it would only be some point.
+    let mut multipliers = [0.0_f32; RADII + 1];
+    for i in (0..ROUNDS).flat_map(|_| 0..=RADII) {
+        let normal = normal(i);
+        let excess = dot(&normal, &terms) / dot(&normal, &normal);
+        let step = excess.max(-multipliers[i]);
+        multipliers[i] += step;
+        for (term, along) in terms.iter_mut().zip(normal) {
+            *term -= step * along;
+        }
+    }
+    let left = (0..=RADII).map(|i| dot(&normal(i), &terms)).fold(0.0, f32::max);
+    terms[0] -= left;
+    std::array::from_fn(|i| terms[i] / powers[i])
 }
 
 /// The cameras with their coefficients, the light that they lose at the corner of a 4:3 photograph, and the names of
@@ -245,22 +270,32 @@ mod tests {
     }
 
     #[test]
-    fn no_pixel_gets_brighter_and_darkness_can_be_left() {
+    fn light_falls_from_the_middle_and_darkness_can_be_left() {
         let mut found = vignettes(&[[0.4, 0.0, -0.1]], &[0]);
-        let is_dim = |found: &Vignettes| {
-            (0..=50).all(|i| light(values(found, 0), 0.01 * i as f32) <= 1.0 + 1e-6)
+        // Between the radii at which the slope is limited, light may rise a little.
+        let is_falling = |values: [f32; COEFFICIENTS]| {
+            (0..50).all(|i| {
+                let [near, far] = [0.01 * i as f32, 0.01 * (i + 1) as f32];
+                light(values, far) <= light(values, near) + 2e-4 && light(values, far) <= 1.0
+            })
         };
+        let is_dim = |found: &Vignettes| is_falling(values(found, 0));
         assert!(is_dim(&found), "{found:?}");
         for step in 0..300 {
             let gradient = towards([0.8, -1.0, 0.7], values(&found, 0));
             found.step(0, &gradient, step as f64 / 300.0);
             assert!(is_dim(&found), "{found:?}");
         }
-        assert!(without_gain([-0.2, 1.0, -1.5])[0] < -0.2, "the middle counts, too");
-        assert_eq!(without_gain([-0.2, 0.1, 0.1]), [-0.2, 0.1, 0.1]);
-        for step in 0..600 {
+        // What would be brighter everywhere changes nothing, instead of leaving a dark ring.
+        let brighter = falling([0.3, 0.5, 0.7]);
+        assert!((1..=5).all(|i| light(brighter, 0.1 * i as f32) > 0.99), "{brighter:?}");
+        for raised in [[-0.2, 1.0, -1.5], [-8.7, 9.4, 16.2], [0.4, 0.0, -0.1]] {
+            assert!(!is_falling(raised) && is_falling(falling(raised)), "{raised:?}");
+        }
+        assert_eq!(falling([-0.2, 0.1, 0.05]), [-0.2, 0.1, 0.05]);
+        for step in 0..1500 {
             let gradient = towards([-0.8, 0.0, 0.0], values(&found, 0));
-            found.step(0, &gradient, step as f64 / 600.0);
+            found.step(0, &gradient, step as f64 / 1500.0);
         }
         assert!((light(values(&found, 0), 0.5) - 0.6).abs() < 0.01, "{found:?}");
     }

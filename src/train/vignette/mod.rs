@@ -1,7 +1,6 @@
 //! Vignettes of cameras, learned together with the model: one per camera, which its views share.
 //!
-//! The factor on light is 1 in the middle of the photograph, so that the model keeps its brightness, and nowhere more
-//! than 1. A weak regularisation towards no vignette fixes what the photographs do not determine. A camera takes an Adam
+//! The factor on light is 1 in the middle of the photograph, so that the model keeps its brightness, and falls from there. A weak regularisation towards no vignette fixes what the photographs do not determine. A camera takes an Adam
 //! step whenever one of its photographs is trained on. The host computes these steps in a fixed order, so that runs are
 //! reproducible.
 
