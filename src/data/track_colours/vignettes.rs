@@ -14,7 +14,7 @@ use densify_core::vignette::{self, COEFFICIENTS, CURVE_OFFSET, PhotographPlace, 
 
 /// Smallest loss of light at which a vignette is learned `[stops at the corner of a 4:3 photograph]`; see
 /// docs/studies/vignette.tsv.
-pub const MIN_STOPS: f64 = 0.15;
+pub const MIN_STOPS: f64 = 0.25;
 /// A loss counts only if it is this many times its standard error.
 const MIN_SIGNIFICANCE: f64 = 3.0;
 /// Smallest spread of r² within tracks. In views of a room it is 0.09.

@@ -54,10 +54,10 @@ pub(crate) struct CameraVignettes {
     /// True if vignettes are learned.
     pub(crate) is_on: bool,
     pub(crate) source: VignetteSource,
-    /// Number of cameras, and of those whose vignette starts from the colours of tracks.
+    /// Number of cameras, and of those that the colours of tracks show to lose light.
     cameras: [usize; 2],
-    /// Initial coefficients; empty if all cameras start without a vignette. Shape: `[cameras]`.
-    start: Vec<[f32; COEFFICIENTS]>,
+    /// Initial coefficients of the cameras whose vignette is known; empty if none is. Shape: `[cameras]`.
+    start: Vec<Option<[f32; COEFFICIENTS]>>,
     /// Name of a view that is one of several of its photograph.
     divided: Option<String>,
 }
@@ -89,13 +89,9 @@ impl CameraVignettes {
         };
         let start = spreads
             .iter()
-            .map(
-                |spread| {
-                    if spread.is_found() { spread.coefficients() } else { [0.0; COEFFICIENTS] }
-                },
-            )
+            .map(|spread| spread.decision().is_some().then(|| spread.coefficients()))
             .collect();
-        let start = if is_on && dimmed > 0 { start } else { Vec::new() };
+        let start = if is_on && strongest.is_some() { start } else { Vec::new() };
         Self { is_on, source, cameras: [spreads.len(), dimmed], start, divided }
     }
 
@@ -115,7 +111,7 @@ impl CameraVignettes {
     pub(crate) fn initial(&self, dataset: &Dataset) -> Option<Vignettes> {
         let cameras = cameras_of(&dataset.train);
         let count = cameras.iter().max().map_or(0, |last| *last as usize + 1);
-        let alike = vec![[0.0; COEFFICIENTS]; count];
+        let alike = vec![None; count];
         let start = if self.start.is_empty() { &alike } else { &self.start };
         let places = dataset.train.iter().filter_map(View::place_in_photograph);
         self.is_on.then(|| Vignettes::new(start, cameras.into_iter().zip(places)))
@@ -126,7 +122,7 @@ impl CameraVignettes {
         let word = if self.is_on { "on" } else { "off" };
         let [cameras, dimmed] = self.cameras;
         match self.source {
-            VignetteSource::Given if self.is_on && dimmed > 0 => {
+            VignetteSource::Given if self.is_on && !self.start.is_empty() => {
                 Some("vignette on, from the colours of points at different radii".to_owned())
             }
             VignetteSource::Given if self.is_on => Some("vignette on, initially none".to_owned()),
@@ -176,7 +172,7 @@ mod tests {
     fn vignettes_are_learned_where_a_camera_clearly_loses_light() {
         let none = VignetteSpread { stops: 0.02, ..CLEAR };
         let both = decided(VignetteChoice::Auto, &[none, CLEAR]);
-        assert!(both.is_on && both.start[0] == [0.0; 3] && both.start[1][0] < -0.5, "{both:?}");
+        assert!(both.is_on && both.start[1].is_some_and(|start| start[0] < -0.5), "{both:?}");
         let line = both.line(Spelling::Terminal).unwrap();
         assert!(line.contains("on (auto)") && line.contains("1 of 2 cameras"), "{line}");
         let off = decided(VignetteChoice::Auto, &[none]);

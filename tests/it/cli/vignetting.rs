@@ -120,9 +120,9 @@ fn divided_photographs_have_no_vignette() {
     let (root, run) = scratch();
     let scene = root.path().join("scene");
     let size = "--size 64 --train 6 --test 2 --points 900 --samples 1";
-    call(&format!("scenegen --preset room {size} --fov 150 --lens fisheye:0 -o {}", text(&scene)))
+    call(&format!("scenegen --preset room {size} --fov 118 --lens fisheye:0 -o {}", text(&scene)))
         .ok();
-    let flags = "--backend cpu --budget 1k";
+    let flags = "--backend cpu --budget 1k --keep-fov";
     train(&scene, &run, 2, &format!("{flags} --vignette on"))
         .refused("faces", &["--vignette on", "several views", "--vignette off"]);
     let stdout = train(&scene, &run, 2, &format!("{flags} --vignette auto")).ok().stdout;
