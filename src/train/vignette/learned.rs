@@ -233,7 +233,11 @@ pub fn named_vignettes<'a>(
             "views": own.map(|(_, name)| name).collect::<Vec<_>>(),
         })
     });
-    serde_json::json!({ "cameras": cameras.collect::<Vec<_>>() })
+    serde_json::json!({
+        "light": "1 + a r^2 + b r^4 + c r^6 of the linear light is left, with the coefficients a, b, c; r: distance \
+                  from the photograph's middle / its longer side",
+        "cameras": cameras.collect::<Vec<_>>(),
+    })
 }
 
 #[cfg(test)]

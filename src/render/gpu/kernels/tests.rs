@@ -135,6 +135,7 @@ fn largest_sizes(formats: Formats) -> Sizes {
     }
     sizes.photographs = KeptPhotographs { count: 1, with_masks: true };
     sizes.exposures = true;
+    sizes.vignettes = true;
     sizes
 }
 
