@@ -144,6 +144,7 @@ pub const STAGES: &[Stage] = &[
     stage("tiles", On::Emits, &[VIEW, SPLAT, FOOTPRINT, shader!("tiles")]),
     stage("rasterize", On::Tiles, &[VIEW, SPLAT, QUADS, shader!("rasterize")]),
     stage("exposure", On::All, &[VIEW, shader!("exposure")]),
+    stage("vignette", On::All, &[VIEW, shader!("vignette")]),
     stage("loss", On::All, &[VIEW, shader!("loss")]),
     stage("depth_gradient", On::All, &[VIEW, shader!("depth_gradient")]),
     stage(

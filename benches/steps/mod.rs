@@ -71,6 +71,7 @@ pub(crate) fn input<'a>(step: u32, camera: &'a Camera, target: &'a Image8) -> St
         background: [0.0; 3],
         exposure: None,
         pose: false,
+        vignette: None,
         depth: None,
         distortion: 0.0,
         sh_degree: 3,

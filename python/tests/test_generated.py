@@ -56,6 +56,7 @@ TYPES = {
     "exposure_model": "str",
     "poses": "str",
     "refine_focal": "bool",
+    "vignette": "str",
     "on_nan": "str",
     "deterministic": "bool",
     "backend": "str",

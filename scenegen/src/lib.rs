@@ -15,6 +15,7 @@
 //! ```
 
 mod camera;
+mod camera_light;
 mod damage;
 mod error;
 mod gltf;

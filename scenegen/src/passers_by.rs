@@ -4,6 +4,7 @@
 use glam::{DVec2, DVec3, Vec3};
 
 use crate::camera::Camera;
+use crate::camera_light::CameraLight;
 use crate::random::Draws;
 use crate::texture::encode;
 use crate::trace::Frame;
@@ -40,13 +41,12 @@ pub(crate) fn draw(
     camera: &Camera,
     seed: u64,
     view: usize,
-    gains: Option<[f32; 3]>,
+    light: Option<CameraLight>,
 ) {
     let mut draws = Draws::new(seed, &[STREAM, view as u64, 2]);
     let Some(depth) = median_depth(frame) else { return };
     let count = 1 + draws.bits() % 2;
     let parts: Vec<Part> = (0..count).flat_map(|_| figure(camera, depth, &mut draws)).collect();
-    let gains = gains.map_or(Vec3::ONE, Vec3::from);
     let mut photograph = frame.exposed.take().unwrap_or_else(|| frame.rgba.clone());
     let mut mask = vec![255; frame.depth.len()];
     let width = frame.width as usize;
@@ -61,7 +61,9 @@ pub(crate) fn draw(
         let (colour, cover) = trace(&parts, camera, corner, scene_depth);
         if cover > 0.0 {
             *mask = 0;
-            *pixel = over(colour * gains / cover, cover, *pixel);
+            let size = [frame.width, frame.height];
+            let factors = light.map_or(Vec3::ONE, |light| light.at(corner + 0.5, size));
+            *pixel = over(colour * factors / cover, cover, *pixel);
         }
     }
     frame.exposed = Some(photograph);

@@ -9,6 +9,7 @@ use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
 use crate::camera::Camera;
+use crate::camera_light::{CameraLight, check_vignette};
 use crate::damage::Damage;
 use crate::error::Error;
 use crate::lens::Lens;
@@ -67,6 +68,9 @@ pub struct Options {
     /// change by up to 10 %.
     #[serde(default)]
     pub exposure_jitter: f32,
+    /// Share of the light that training views lose at the corners of the picture, from 0 to 0.99.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub vignette: f32,
     /// Lens of training views; test views are always pinhole images.
     #[serde(default)]
     pub lens: Option<Lens>,
@@ -99,6 +103,7 @@ impl Default for Options {
             lambert: false,
             exposure: None,
             exposure_jitter: 0.0,
+            vignette: 0.0,
             lens: None,
             passers_by: 0.0,
             damage: Damage::default(),
@@ -106,6 +111,11 @@ impl Default for Options {
             seed: 0,
         }
     }
+}
+
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "serde passes a reference")]
+fn is_zero(value: &f32) -> bool {
+    *value == 0.0
 }
 
 /// Largest relative change of red and blue with [`Options::exposure_jitter`].
@@ -295,10 +305,10 @@ impl Scene {
 
     /// Renders a view. The result does not depend on the number of threads.
     pub fn render(&self, view: usize) -> Frame {
-        let (camera, gains) = (&self.views[view].camera, self.gains(view));
-        let mut frame = self.tracer().render(camera, view as u64, gains);
+        let (camera, light) = (&self.views[view].camera, self.camera_light(view));
+        let mut frame = self.tracer().render(camera, view as u64, light);
         if self.has_passers.get(view) == Some(&true) {
-            passers_by::draw(&mut frame, camera, self.options.seed, view, gains);
+            passers_by::draw(&mut frame, camera, self.options.seed, view, light);
         }
         frame
     }
@@ -347,6 +357,15 @@ impl Scene {
         Some([gain * red, gain, gain * blue])
     }
 
+    /// What the camera does to the light of a training view, if it does anything.
+    fn camera_light(&self, view: usize) -> Option<CameraLight> {
+        let is_training = self.views[view].split == Split::Train;
+        let vignette = if is_training { self.options.vignette } else { 0.0 };
+        let gains = self.gains(view);
+        let gains = gains.or((vignette > 0.0).then_some([1.0; 3]))?;
+        Some(CameraLight { gains, vignette })
+    }
+
     /// A collector of initial points, which must be given the training views as they are rendered.
     pub fn point_collector(&self) -> PointCollector<'_> {
         PointCollector::new(self.tracer(), &self.train_cameras, self.options.points)
@@ -373,6 +392,7 @@ fn check(options: &Options) -> Result<(), Error> {
     share("--outliers", options.points.outliers)?;
     share("--dropout", options.points.dropout)?;
     share("--passers-by", options.passers_by)?;
+    check_vignette(options.vignette)?;
     options.damage.check()?;
     if !(1..=64).contains(&options.grid) {
         return Err(Error::option(

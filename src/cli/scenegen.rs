@@ -102,6 +102,10 @@ pub(super) struct ScenegenArgs {
     /// views and points are unchanged; scene.json has the factors
     #[arg(long, value_name = "STOPS", help_heading = "Light", default_value_t = 0.0)]
     exposure_jitter: f32,
+    /// Darken training views towards the corners of the picture, which lose this share of their light: 0.5 is one stop.
+    /// Test views and points are unchanged
+    #[arg(long, value_name = "STRENGTH", help_heading = "Light", default_value_t = 0.0)]
+    vignette: f32,
 
     /// Number of initial points, on surfaces with detail that at least three views see
     #[arg(long, value_name = "N", help_heading = "Points", default_value_t = 5000)]
@@ -244,6 +248,7 @@ impl ScenegenArgs {
             lambert: self.lambert,
             exposure: self.exposure,
             exposure_jitter: self.exposure_jitter,
+            vignette: self.vignette,
             lens: self.lens,
             passers_by: self.passers_by,
             damage: Damage {

@@ -19,3 +19,4 @@ pub mod sh;
 pub mod similarity;
 pub mod spelling;
 pub mod spline;
+pub mod vignette;

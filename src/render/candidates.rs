@@ -11,6 +11,7 @@ use densify_core::camera::Camera;
 use densify_core::colour::ColourTransform;
 use densify_core::image::Image8;
 use densify_core::image::depth::DepthMap;
+use densify_core::vignette::Vignette;
 use glam::DVec2;
 
 /// The candidates collected so far, and the request that selects them.
@@ -21,37 +22,41 @@ pub(super) struct Candidates {
     ranking: Vec<RankedPixel>,
 }
 
-/// A photograph with the camera, background, exposure and given depth of its view.
+/// A photograph with the camera, background, exposure, vignette and given depth of its view.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Photograph<'a> {
     camera: &'a Camera,
     target: &'a Image8,
     background: [f32; 3],
     exposure: Option<&'a ColourTransform>,
+    vignette: Option<&'a Vignette>,
     depth: Option<&'a DepthMap>,
 }
 
 impl<'a> From<&StepInput<'a>> for Photograph<'a> {
     fn from(input: &StepInput<'a>) -> Self {
-        let StepInput { camera, target, background, exposure, depth, .. } = *input;
-        Self { camera, target, background, exposure, depth: depth.map(|depth| depth.map) }
+        let StepInput { camera, target, background, exposure, vignette, depth, .. } = *input;
+        let depth = depth.map(|depth| depth.map);
+        Self { camera, target, background, exposure, vignette, depth }
     }
 }
 
 impl<'a> From<&AuxInput<'a>> for Photograph<'a> {
     fn from(input: &AuxInput<'a>) -> Self {
-        let AuxInput { camera, target, background, exposure, depth, .. } = *input;
-        Self { camera, target, background, exposure, depth }
+        let AuxInput { camera, target, background, exposure, vignette, depth, .. } = *input;
+        Self { camera, target, background, exposure, vignette, depth }
     }
 }
 
 impl<'a> Photograph<'a> {
-    /// A function that returns the scene's colour at a pixel (x, y), with the exposure undone.
+    /// A function that returns the scene's colour at a pixel (x, y), with the vignette and the exposure undone.
     pub(super) fn scene_colours(self) -> impl Fn(usize, usize) -> [f32; 3] + Sync + 'a {
-        let Self { target, background, exposure, .. } = self;
+        let Self { target, background, exposure, vignette, .. } = self;
         let inverse = exposure.map(ColourTransform::inverse);
         move |x, y| {
             let seen = target.composited(x, y, background);
+            let seen =
+                vignette.map_or(seen, |vignette| vignette.undo(x, y, target.alpha_at(x, y), seen));
             inverse.map_or(seen, |inverse| inverse.apply(seen))
         }
     }

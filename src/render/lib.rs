@@ -42,6 +42,7 @@ use densify_core::image::Image8;
 use densify_core::image::depth::DepthMap;
 use densify_core::memory::Ledger;
 use densify_core::pose::PoseGradient;
+use densify_core::vignette::{COEFFICIENTS, Vignette};
 pub use densify_shaders::Accumulation;
 pub use depth::{DepthTarget, DepthTerm};
 pub use differentiable::{Differentiable, ImageGradient};
@@ -91,6 +92,9 @@ pub struct StepInput<'a> {
     pub exposure: Option<&'a ColourTransform>,
     /// True to differentiate with respect to the camera's pose; requires a backend [set up](Setup::poses) for it.
     pub pose: bool,
+    /// The vignette of the photograph, which follows the exposure; requires a backend [set up](Setup::vignettes) for
+    /// vignettes. It dims the background only where the photograph is opaque.
+    pub vignette: Option<&'a Vignette>,
     /// Given depth of the view; requires a backend [set up](Setup::depth) for depth.
     pub depth: Option<DepthTarget<'a>>,
     /// Weight λ of the distortion term, λ/N·Σ w·(x/X − 1)² over pixels and Gaussians, where x is a Gaussian's inverse
@@ -128,6 +132,8 @@ pub struct AuxInput<'a> {
     pub background: [f32; 3],
     /// See [`StepInput::exposure`].
     pub exposure: Option<&'a ColourTransform>,
+    /// See [`StepInput::vignette`].
+    pub vignette: Option<&'a Vignette>,
     /// Spherical-harmonic degree to evaluate, <= the model's.
     pub sh_degree: u8,
     /// The given depth of the view, of the camera's size, if the run trains on depth.
@@ -141,8 +147,20 @@ impl<'a> AuxInput<'a> {
     /// target, an image of the camera's size.
     pub fn of_rows(camera: &'a Camera, target: &'a Image8, request: &'a AuxRequest) -> Self {
         let (step, view, seed, sh_degree) = (0, 0, 0, 0);
-        let (background, exposure, depth) = ([0.0; 3], None, None);
-        Self { step, view, seed, camera, target, background, exposure, sh_degree, depth, request }
+        let (background, exposure, vignette, depth) = ([0.0; 3], None, None, None);
+        Self {
+            step,
+            view,
+            seed,
+            camera,
+            target,
+            background,
+            exposure,
+            vignette,
+            sh_degree,
+            depth,
+            request,
+        }
     }
 }
 
@@ -177,6 +195,8 @@ pub struct StepOutput {
     /// Gradient of the loss with respect to the camera's pose and focal length, through the rows that are not frozen,
     /// if it was requested.
     pub pose: Option<PoseGradient>,
+    /// Gradient of the loss with respect to the coefficients of the vignette, if there is one.
+    pub vignette: Option<[f32; COEFFICIENTS]>,
     /// The [depth term](DepthTerm) without its weight, if depth is given.
     pub depth: Option<f32>,
 }

@@ -37,6 +37,8 @@ pub struct Setup {
     pub exposures: bool,
     /// True if steps may be differentiated with respect to the camera's pose.
     pub poses: bool,
+    /// True if steps and [observed](crate::Backend::observe) views may have vignettes.
+    pub vignettes: bool,
     /// True if steps may have given depth or a distortion term.
     pub depth: bool,
     /// True if the backend only renders, and so needs no memory for training (native backend).
@@ -60,6 +62,7 @@ impl Setup {
             needs: Needs::default(),
             exposures: false,
             poses: false,
+            vignettes: false,
             depth: false,
             only_renders: false,
         }

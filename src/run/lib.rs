@@ -30,7 +30,7 @@ pub use observer::{Interrupt, NextAction, Observer, Silent, check_interrupt, say
 pub use process::{MemoryLimit, ProcessMemory, grant};
 pub use resolved::{
     Alternatives, DEFAULT_BUDGET, DegreeSource, ExposureSource, Findings, ModelSize, Plan,
-    PoseSource, RunConfig, estimate, host_bytes, plan,
+    PoseSource, RunConfig, VignetteSource, estimate, host_bytes, plan,
 };
 pub use session::{LeftOut, Occupied, Reductions, Requirements, Resumed, Run, start};
 pub use spec::{

@@ -15,6 +15,7 @@ use densify_train::evaluate::Split;
 use densify_train::exposure::{ExposureChoice, ExposureModel, fitted};
 use densify_train::metrics::psnr;
 use densify_train::poses::PoseChoice;
+use densify_train::vignette::VignetteChoice;
 
 use crate::failure::Failure;
 use crate::finished::views_of;
@@ -47,6 +48,8 @@ pub struct TrainedModel {
     pub exposure: Option<ExposureModel>,
     /// Whether the poses of the model's run were refined, and focal lengths with them.
     pub poses: (PoseChoice, bool),
+    /// True if the model was trained with a vignette per camera.
+    pub vignette: bool,
     /// Near plane, as a fraction of the scene's extent; `None`: the usual near plane of the dataset.
     pub near: Option<Fraction>,
 }
@@ -98,8 +101,9 @@ impl TrainedModel {
                 ))
             })?;
             let (data, depth, near) = given;
+            let (exposure, vignette) = (None, false);
             let poses = (PoseChoice::Fixed, false);
-            return Ok(Self { file, scene, data, depth, exposure: None, poses, near });
+            return Ok(Self { file, scene, data, depth, exposure, vignette, poses, near });
         }
         let config = RunConfig::read(model)?;
         let scene = scene.unwrap_or_else(|| config.scene_path());
@@ -108,8 +112,9 @@ impl TrainedModel {
         let choice =
             if config.resolved.refines_poses { PoseChoice::Refine } else { PoseChoice::Fixed };
         let poses = (choice, config.spec.schedule.refine_focal);
+        let vignette = config.resolved.has_vignettes;
         let RunSpec { data, depth, start, .. } = config.spec;
-        Ok(Self { file, scene, data, depth, exposure, poses, near: start.near })
+        Ok(Self { file, scene, data, depth, exposure, vignette, poses, near: start.near })
     }
 
     /// Describes the run that trains `model`, which is or will be saved in `scratch`.
@@ -148,6 +153,9 @@ impl TrainedModel {
             spec.schedule.exposure_model = exposure_model;
         }
         (spec.schedule.poses, spec.schedule.refine_focal) = self.poses;
+        if self.vignette {
+            spec.schedule.vignette = VignetteChoice::On;
+        }
         spec.output.coordinates =
             if model.is_local() { Coordinates::Local } else { Coordinates::World };
         Ok(spec)

@@ -47,6 +47,7 @@ pub fn importance(
             target: &image,
             background,
             exposure: None,
+            vignette: None,
             sh_degree,
             depth: None,
             request: &request,

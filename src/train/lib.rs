@@ -13,3 +13,4 @@ pub mod pictures;
 pub mod poses;
 pub mod schedule;
 pub mod trainer;
+pub mod vignette;

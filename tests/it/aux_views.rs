@@ -91,6 +91,7 @@ fn observe(
         target: &scene.target,
         background: BACKGROUND,
         exposure: None,
+        vignette: None,
         sh_degree: 2,
         depth: scene.depth.as_ref(),
         request,

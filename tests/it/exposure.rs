@@ -16,20 +16,20 @@ use densify_policies::policy::{ErrorMode, Needs, PixelLoss};
 use crate::subject::{BLUE, all, make_with, normalised, repeatable, step_input};
 
 /// Step of the central difference, to either side.
-const STEP: f64 = 1e-6;
-const EXPOSURE: ColourTransform = ColourTransform {
+pub(super) const STEP: f64 = 1e-6;
+pub(super) const EXPOSURE: ColourTransform = ColourTransform {
     matrix: [[1.2, 0.05, -0.1], [0.02, 0.7, 0.15], [-0.05, 0.1, 1.3]],
     offset: [0.03, -0.06, 0.11],
 };
 
-struct Scene {
-    model: Gaussians,
-    camera: Camera,
-    target: Image8,
+pub(super) struct Scene {
+    pub(super) model: Gaussians,
+    pub(super) camera: Camera,
+    pub(super) target: Image8,
 }
 
 /// Gaussians that leave much of the background visible. The photograph may be partly transparent.
-fn scene(with_alpha: bool) -> Scene {
+pub(super) fn scene(with_alpha: bool) -> Scene {
     let camera = scenes::camera(37, 29, 61);
     let model = normalised(scenes::cloud(14, 1, &camera, 62));
     let mut target = scenes::target(&camera);
@@ -38,23 +38,28 @@ fn scene(with_alpha: bool) -> Scene {
 }
 
 impl Scene {
-    fn size(&self) -> (usize, usize) {
+    pub(super) fn size(&self) -> (usize, usize) {
         (self.camera.width as usize, self.camera.height as usize)
     }
 
-    fn view(&self) -> View<'_> {
+    pub(super) fn view(&self) -> View<'_> {
         View { camera: &self.camera, background: [0.0; 3], sh_degree: 1 }
     }
 
     /// The photograph composited on the background.
-    fn truth(&self) -> Vec<f64> {
+    pub(super) fn truth(&self) -> Vec<f64> {
         let (width, height) = self.size();
         let at = |pixel: usize| self.target.composited(pixel % width, pixel / width, BLUE);
         (0..width * height).flat_map(at).map(f64::from).collect()
     }
 
     /// The image compared with the photograph: the exposed foreground on the background.
-    fn exposed(&self, foreground: &[f64], alpha: &[f64], exposure: &[f64; 12]) -> Vec<f64> {
+    pub(super) fn exposed(
+        &self,
+        foreground: &[f64],
+        alpha: &[f64],
+        exposure: &[f64; 12],
+    ) -> Vec<f64> {
         let pixel = |(colour, alpha): (&[f64; 3], &f64)| -> [f64; 3] {
             std::array::from_fn(|i| {
                 let row = &exposure[3 * i..3 * i + 3];
@@ -67,7 +72,7 @@ impl Scene {
 }
 
 /// The matrix followed by the offset.
-fn numbers(transform: &ColourTransform) -> [f64; 12] {
+pub(super) fn numbers(transform: &ColourTransform) -> [f64; 12] {
     let all: Vec<f64> =
         transform.matrix.concat().into_iter().chain(transform.offset).map(f64::from).collect();
     all.try_into().expect("twelve numbers")
@@ -89,7 +94,7 @@ fn step(
 
 /// The gradients of the geometry in the first step, recovered from the first moment, which is a tenth of them.
 /// Shape: [rows, 11].
-fn gradients(backend: &dyn Differentiable) -> Vec<[f64; 11]> {
+pub(super) fn gradients(backend: &dyn Differentiable) -> Vec<[f64; 11]> {
     let names = ["moments.first", "device.first rows"];
     let state = backend.state();
     let name = names.iter().find(|name| state.iter().any(|array| array.name == **name));
@@ -235,6 +240,7 @@ fn auxiliary_views_and_candidates_apply_the_exposure() {
             target: &scene.target,
             background: BLUE,
             exposure: Some(&EXPOSURE),
+            vignette: None,
             sh_degree: 1,
             depth: None,
             request: &request,

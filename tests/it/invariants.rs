@@ -196,6 +196,7 @@ const MODULES: [(&str, &[&str]); 5] = [
             "gaussians",
             "spelling",
             "spline",
+            "vignette",
             "camera_path",
         ],
     ),
@@ -238,6 +239,7 @@ const MODULES: [(&str, &[&str]); 5] = [
         "src/train",
         &[
             "exposure",
+            "vignette",
             "metrics",
             "evaluate",
             "importance",

@@ -5,7 +5,8 @@
 //! - Reference: `central` checks the float64 renderer by central differences; `oracle` compares it and the backends
 //!   with stored float64 renders; `extremes` runs the selftest, and its head lists the tests of each numerical extreme.
 //! - Backends: `agreement` compares them with the native one; `properties` tests arbitrary scenes; `sameness` and
-//!   `resuming` compare bit by bit; `exposure`, `frozen`, `painted`, `poses` and `undeclared` test single features; `gpu` tests
+//!   `resuming` compare bit by bit; `exposure`, `vignette`, `poses`, `frozen`, `painted` and `undeclared` test single
+//!   features; `gpu` tests
 //!   features that only the GPU backend has.
 //! - Policies: `edits` applies random plans to a backend and to a plain vector; `spatial` is a policy with spatial rules.
 //! - Program: `cli` runs it on a small scene and on scenes with known surfaces; `fuzz` damages input files.
@@ -42,3 +43,4 @@ mod spatial;
 mod storage;
 mod subject;
 mod undeclared;
+mod vignette;

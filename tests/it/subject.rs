@@ -160,6 +160,7 @@ pub(crate) fn step_input<'a>(
         background: BLUE,
         exposure: None,
         pose: false,
+        vignette: None,
         depth: None,
         distortion: 0.0,
         sh_degree,

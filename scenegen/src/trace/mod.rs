@@ -6,6 +6,7 @@ use glam::{DVec2, DVec3, Vec2, Vec3};
 use rayon::prelude::*;
 
 use crate::camera::Camera;
+use crate::camera_light::CameraLight;
 use crate::intersect::Intersection;
 use crate::mesh::Model;
 use crate::packet::LANES;
@@ -32,7 +33,7 @@ pub struct Frame {
     pub height: u32,
     /// sRGB colour and straight alpha (coverage). Shape: `[height, width, 4]`.
     pub rgba: Vec<u8>,
-    /// The photograph, if it differs from `rgba` by its exposure or by passers-by. Shape: `[height, width, 4]`.
+    /// The photograph, if it differs from `rgba` by its exposure, a vignette or passers-by. Shape: `[height, width, 4]`.
     pub exposed: Option<Vec<u8>>,
     /// 0 where [passers-by](crate::Options::passers_by) cover the scene, 255 elsewhere; `None` for views without
     /// passers-by. Shape: `[height, width]`.
@@ -127,14 +128,13 @@ impl Frame {
 }
 
 impl Tracer<'_> {
-    /// Renders a view; its index `view` seeds the random numbers. With `gains`, also renders the exposed photograph,
-    /// with these factors on the channels.
-    pub(crate) fn render(&self, camera: &Camera, view: u64, gains: Option<[f32; 3]>) -> Frame {
+    /// Renders a view; its index `view` seeds the random numbers. With `light`, also renders the photograph that such a
+    /// camera takes.
+    pub(crate) fn render(&self, camera: &Camera, view: u64, light: Option<CameraLight>) -> Frame {
         let mut frame = Frame::empty(camera.width, camera.height);
         let width = camera.width as usize;
-        let mut exposed = vec![0; if gains.is_some() { frame.rgba.len() } else { 0 }];
-        let gains = gains.map(Vec3::from);
-        let per_band = if gains.is_some() { 4 * BAND * width } else { 0 };
+        let mut exposed = vec![0; if light.is_some() { frame.rgba.len() } else { 0 }];
+        let per_band = if light.is_some() { 4 * BAND * width } else { 0 };
         let mut rest = &mut exposed[..];
         let exposed_bands: Vec<&mut [u8]> = (0..(camera.height as usize).div_ceil(BAND))
             .map(|_| rest.split_off_mut(..per_band.min(rest.len())).unwrap_or_default())
@@ -160,11 +160,12 @@ impl Tracer<'_> {
                     let i = y * width + x;
                     let pixel = DVec2::new(x as f64, (top + y) as f64);
                     let draws = Draws::new(self.seed, &[view, ((top + y) * width + x) as u64]);
-                    let (light, coverage, hint) = self.pixel(camera, pixel, draws);
-                    rgba[4 * i..4 * i + 4].copy_from_slice(&encoded(light, coverage));
-                    if let Some(gains) = gains {
+                    let (colour, coverage, hint) = self.pixel(camera, pixel, draws);
+                    rgba[4 * i..4 * i + 4].copy_from_slice(&encoded(colour, coverage));
+                    if let Some(light) = light {
+                        let factors = light.at(pixel + 0.5, [camera.width, camera.height]);
                         exposed[4 * i..4 * i + 4]
-                            .copy_from_slice(&encoded(light * gains, coverage));
+                            .copy_from_slice(&encoded(colour * factors, coverage));
                     }
                     let direction = camera.direction(pixel + 0.5);
                     if let Some(first) = self.first_solid(camera.centre, direction, hint) {
@@ -175,7 +176,7 @@ impl Tracer<'_> {
                 }
             }
         });
-        frame.exposed = gains.map(|_| exposed);
+        frame.exposed = light.map(|_| exposed);
         frame
     }
 

@@ -111,6 +111,12 @@ fn names(folder: &Path) -> Vec<String> {
     names
 }
 
+/// Linear light of an encoded value.
+fn light(value: u8) -> f64 {
+    let v = f64::from(value) / 255.0;
+    if v <= 0.04045 { v / 12.92 } else { ((v + 0.055) / 1.055).powf(2.4) }
+}
+
 /// Training views are exposed by the recorded factors; test views, depth and points are unchanged.
 #[test]
 fn exposures_vary_in_training_views_only() {
@@ -122,10 +128,6 @@ fn exposures_vary_in_training_views_only() {
     let pixels = |folder: &Path, number: usize| {
         let path = folder.join(format!("images/train/r_{number:03}.png"));
         image::open(path).expect("PNG").into_rgba8().into_raw()
-    };
-    let light = |value: u8| {
-        let v = f64::from(value) / 255.0;
-        if v <= 0.04045 { v / 12.92 } else { ((v + 0.055) / 1.055).powf(2.4) }
     };
     let mut stops = Vec::new();
     for number in 0..4 {
@@ -154,6 +156,48 @@ fn exposures_vary_in_training_views_only() {
     }
     stops.sort_by(f64::total_cmp);
     assert!(stops[3] - stops[0] > 0.2, "{stops:?}");
+}
+
+/// Training views lose light towards their corners by the recorded share; test views, depth and points are unchanged.
+#[test]
+fn vignettes_darken_training_views_only() {
+    let (_root, [a, b]) = written(Options { vignette: 0.5, ..small().options });
+    for name in ["images/test/r_001.png", "depth/train/r_001.exr", "points3d.ply"] {
+        assert!(read(&a, name) == read(&b, name), "{name}");
+    }
+    let record =
+        |folder| -> Value { serde_json::from_slice(&read(folder, "scene.json")).expect("JSON") };
+    assert_eq!(record(&b)["options"]["vignette"], 0.5);
+    assert!(record(&a)["options"].get("vignette").is_none());
+    let pixels = |folder: &Path, number: usize| {
+        let path = folder.join(format!("images/train/r_{number:03}.png"));
+        image::open(path).expect("PNG").into_rgba8()
+    };
+    let (mut compared, mut darkest) = (0, 1.0_f64);
+    for number in 0..4 {
+        let (plain, dimmed) = (pixels(&a, number), pixels(&b, number));
+        let half = [plain.width(), plain.height()].map(|side| 0.5 * f64::from(side));
+        for (x, y, colour) in plain.enumerate_pixels() {
+            let seen = dimmed.get_pixel(x, y);
+            assert_eq!(colour[3], seen[3], "alpha changed");
+            let at = [f64::from(x) + 0.5 - half[0], f64::from(y) + 0.5 - half[1]];
+            let d2 = (at[0] * at[0] + at[1] * at[1]) / (half[0] * half[0] + half[1] * half[1]);
+            // The cos⁴ law that halves the light at d = 1.
+            let expected = (1.0 + (2.0_f64.sqrt() - 1.0) * d2).powi(-2);
+            for c in (0..3).filter(|&c| colour[3] > 0 && colour[c] < 255 && seen[c] > 60) {
+                let ratio = light(seen[c]) / light(colour[c]);
+                assert!((ratio / expected - 1.0).abs() < 0.05, "{x}, {y}: {ratio} {expected}");
+                (compared, darkest) = (compared + 1, darkest.min(expected));
+            }
+        }
+    }
+    assert!(compared > 100 && darkest < 0.8, "{compared}, {darkest}");
+    for bad in [-0.1, 1.0, f32::NAN] {
+        let options = Options { vignette: bad, ..small().options };
+        let refused =
+            Scene::prepare(&Source::Preset("spheres".into()), &options).err().expect("refused");
+        assert!(refused.to_string().contains("--vignette"), "{refused}");
+    }
 }
 
 #[test]

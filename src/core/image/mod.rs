@@ -45,10 +45,16 @@ impl Image8 {
         Self { width, height, rgb, alpha: None, mask: None }
     }
 
+    /// Alpha of a pixel, in `[0, 1]`.
+    pub fn alpha_at(&self, x: usize, y: usize) -> f32 {
+        let pixel = y * self.width as usize + x;
+        self.alpha.as_ref().map_or(1.0, |a| f32::from(a[pixel]) / 255.0)
+    }
+
     /// The colour of a pixel over `background`, in `[0, 1]`.
     pub fn composited(&self, x: usize, y: usize, background: [f32; 3]) -> [f32; 3] {
         let pixel = y * self.width as usize + x;
-        let alpha = self.alpha.as_ref().map_or(1.0, |a| f32::from(a[pixel]) / 255.0);
+        let alpha = self.alpha_at(x, y);
         std::array::from_fn(|channel| {
             alpha * f32::from(self.rgb[3 * pixel + channel]) / 255.0
                 + (1.0 - alpha) * background[channel]

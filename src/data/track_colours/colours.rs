@@ -3,6 +3,7 @@
 use crate::dataset::{MIN_VIEWS, Tracks, View};
 use crate::error::LoadError;
 use densify_core::image::Image8;
+use densify_core::vignette::Vignette;
 
 /// Rounds of alternately fitting gains and colours of tracks.
 const ROUNDS: usize = 3;
@@ -20,9 +21,9 @@ pub(super) struct Observation {
     /// Colour at the point.
     pub(super) centre: [u8; 3],
     /// Smallest values of the pixel at the point and of its neighbours.
-    lowest: [u8; 3],
+    pub(super) lowest: [u8; 3],
     /// Largest values of these pixels.
-    highest: [u8; 3],
+    pub(super) highest: [u8; 3],
 }
 
 /// Peak memory for reading and measuring the colours of tracks, in addition to an image `[bytes]`.
@@ -84,6 +85,29 @@ impl TrackColours {
         let by_track: Vec<&[Observation]> = by_track(&observations).collect();
         let fits = std::array::from_fn(|channel| fit(&by_track, views.len(), channel));
         Ok(Self { observations, fits })
+    }
+
+    /// Brightens the colours as if the views had no vignettes, and fits gains and track colours again. `vignettes` has
+    /// the vignette of each view, if there is one.
+    pub fn undo_vignettes(
+        &mut self,
+        tracks: &Tracks,
+        views: &[View],
+        vignettes: &[Option<Vignette>],
+    ) {
+        for colour in &mut self.observations {
+            let view = colour.view as usize;
+            let Some(vignette) = vignettes[view] else { continue };
+            let (pixel, _) = views[view].camera.project(tracks.positions[colour.track as usize]);
+            for values in [&mut colour.centre, &mut colour.lowest, &mut colour.highest] {
+                let seen = values.map(|value| f32::from(value) / 255.0);
+                let undone = vignette.undo(pixel.x as usize, pixel.y as usize, 1.0, seen);
+                // The cast saturates; values at the limits are not trusted.
+                *values = undone.map(|value| (255.0 * value).round() as u8);
+            }
+        }
+        let by_track: Vec<&[Observation]> = by_track(&self.observations).collect();
+        self.fits = std::array::from_fn(|channel| fit(&by_track, views.len(), channel));
     }
 
     /// The observations of each track with enough views.

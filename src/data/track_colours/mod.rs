@@ -20,6 +20,7 @@
 
 mod colours;
 pub mod exposures;
+pub mod vignettes;
 
 use serde::{Deserialize, Serialize};
 

@@ -12,6 +12,7 @@ use crate::dataset::{Dataset, LoadOptions, View};
 use crate::error::LoadError;
 use densify_core::camera::Camera;
 use densify_core::image::Image8;
+use densify_core::vignette::{PhotographPlace, Vignette};
 
 const SIZE: u32 = 60;
 const VIEWS: usize = 8;
@@ -108,6 +109,27 @@ fn colours_that_change_with_the_view_need_a_higher_degree() {
         let found = Spread { tracks: MIN_TRACKS, ..measured(&tracks, &views).unwrap() };
         assert_eq!(found.degree(), Some(degree), "{strength}: {found:?}");
     }
+}
+
+/// Every second view has a vignette. Once it is undone, all views are alike again.
+#[test]
+fn undone_vignettes_leave_equal_colours() {
+    let place = PhotographPlace { middle: [30.0, 30.0], pixel: [1.0 / 60.0; 2] };
+    let vignette = Vignette { coefficients: [-1.2, 0.2, 0.0], place };
+    let squares = (SIZE / 3) as usize;
+    let (tracks, views) = scene(|view, square, value| {
+        let (x, y) = (3 * (square % squares) + 1, 3 * (square / squares) + 1);
+        let [dimmed, ..] = vignette.apply(x, y, 1.0, [value / 255.0; 3]);
+        if view.is_multiple_of(2) { 255.0 * dimmed } else { value }
+    });
+    let mut colours = TrackColours::read(&tracks, &views).unwrap();
+    assert!(measure(&tracks, &colours).twentieth > 4.0 && (colours.gains(0)[1] - 1.0).abs() > 0.05);
+    let of_views: Vec<_> =
+        (0..VIEWS).map(|view| view.is_multiple_of(2).then_some(vignette)).collect();
+    colours.undo_vignettes(&tracks, &views, &of_views);
+    let found = measure(&tracks, &colours);
+    assert!(found.twentieth < 1.0, "{found:?}");
+    assert!(colours.gains(0).iter().all(|gain| (gain - colours.gains(1)[0]).abs() < 0.02));
 }
 
 #[test]

@@ -42,6 +42,7 @@ mod summed;
 mod surface;
 mod threads;
 mod tiles;
+mod vignette;
 
 use std::ops::Range;
 use std::sync::Arc;
@@ -218,18 +219,23 @@ impl CpuBackend {
 
     /// Runs a training step on a thread of the pool; unless it `trains`, only the pose is differentiated.
     fn step(&mut self, input: &StepInput<'_>, trains: bool) -> Result<StepOutput, BackendError> {
-        let StepInput { camera, target, background, exposure, .. } = *input;
+        let StepInput { camera, target, background, exposure, vignette, .. } = *input;
         let unexposed = exposure.map_or(background, |exposure| exposure.behind(background));
         let (depth, plane) = self.depth_loss(input);
         let frame = self.forward(camera, unexposed, input.sh_degree, plane, None)?;
         if let Some(exposure) = exposure {
             self.expose(&frame.grid, exposure);
         }
+        if let Some(vignette) = vignette {
+            self.dim(&frame.grid, vignette, target);
+        }
         let picks = trains.then(|| self.candidates.due(input.step, self.rows)).flatten();
         let weights = picks.and_then(|(request, _)| error_weights(request.error));
         let for_rows = self.signals.layout().has(Field::Error).then_some(self.signals.planes.score);
         let errors = ErrorRequests { for_candidates: weights, for_rows };
         let value = self.image_loss(&frame.grid, target, background, errors);
+        let vignette_gradient =
+            vignette.map(|vignette| self.dim_bwd(&frame.grid, vignette, target));
         let exposure_gradient =
             exposure.map(|exposure| self.exposure_bwd(&frame.grid, exposure, background));
         if let Some((request, count)) = picks {
@@ -249,6 +255,7 @@ impl CpuBackend {
             bands: frame.bands.len() as u32,
             exposure: exposure_gradient,
             pose,
+            vignette: vignette_gradient,
             depth,
             ..scalars(value)
         })

@@ -48,7 +48,7 @@ pub(super) fn bytes(request: &AuxRequest, pixels: usize) -> u64 {
 impl CpuBackend {
     /// Renders and measures a view.
     pub(super) fn observe_view(&mut self, input: &AuxInput<'_>) -> Result<AuxOutput, BackendError> {
-        let AuxInput { camera, target, background, exposure, request, .. } = *input;
+        let AuxInput { camera, target, background, exposure, vignette, request, .. } = *input;
         let unexposed = exposure.map_or(background, |exposure| exposure.behind(background));
         assert_same_size(camera, target);
         // Stage times remain those of training.
@@ -57,6 +57,9 @@ impl CpuBackend {
         let measured = frame.map(|frame| {
             if let Some(exposure) = exposure {
                 self.expose(&frame.grid, exposure);
+            }
+            if let Some(vignette) = vignette {
+                self.dim(&frame.grid, vignette, target);
             }
             let no_errors = ErrorRequests::default();
             let loss = scalars(self.image_loss(&frame.grid, target, background, no_errors)).loss;

@@ -104,6 +104,7 @@ fn run(
             background: BACKGROUND,
             exposure: None,
             pose: false,
+            vignette: None,
             depth: map.map(|map| {
                 let term = if step == 1 { DepthTerm::Expected } else { DepthTerm::Samples };
                 DepthTarget { map, weight: 1.0, term }

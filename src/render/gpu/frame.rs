@@ -67,6 +67,7 @@ impl State {
             bands,
             exposure: None,
             pose: None,
+            vignette: None,
             depth: None,
         }
     }

@@ -41,7 +41,8 @@ pub(super) fn sizes(device: &Device, sh_degree: u8, options: &Setup) -> Sizes {
     let (needs, depth) = (&options.needs, options.depth);
     let mut sizes = Sizes::new(budget, cap, sh_degree, image, needs, depth, device.accumulation);
     sizes.photographs = options.photographs;
-    sizes.exposures = options.exposures;
+    sizes.exposures = options.exposures || options.vignettes;
+    sizes.vignettes = options.vignettes;
     sizes.poses = options.poses;
     sizes.storage = options.storage;
     // The photographs are in one buffer, which no kernel binds.

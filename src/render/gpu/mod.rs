@@ -34,6 +34,7 @@ mod state;
 mod step;
 mod submit;
 mod transfer;
+mod vignette;
 
 use std::collections::HashMap;
 use std::ops::Range;
@@ -112,6 +113,8 @@ pub struct GpuBackend {
     exposure_sums: [[f32; 4]; 4],
     /// Sums of the last step's gradient with respect to the pose, if it had one.
     pose_sums: [[f32; 4]; 2],
+    /// The same of its vignette; see `shaders/vignette.wgsl`.
+    vignette_sums: [f32; 4],
     /// Number of bands to encode for the next view.
     bands: u32,
     stage_times: Vec<(&'static str, Duration)>,
@@ -162,6 +165,7 @@ impl GpuBackend {
             photographs: HashMap::new(),
             exposure_sums: [[0.0; 4]; 4],
             pose_sums: [[0.0; 4]; 2],
+            vignette_sums: [0.0; 4],
             bands: 1,
             stage_times: Vec::new(),
         };

@@ -169,21 +169,25 @@ impl GpuBackend {
 
     /// Measures an auxiliary view.
     pub(super) fn observe_view(&mut self, input: &AuxInput<'_>) -> Result<AuxOutput, BackendError> {
-        let AuxInput { camera, target, background, exposure, request, .. } = *input;
+        let AuxInput { camera, target, background, exposure, vignette, request, .. } = *input;
         assert_same_size(camera, target);
         self.fit_image(camera.width, camera.height)?;
         let mut frame = self.frame(camera, background, input.sh_degree);
         frame.draw[3] = self.load_photograph(input.view, target);
-        self.load_exposure(&mut frame, exposure);
+        let is_exposed = self.load_camera(&mut frame, exposure, vignette);
         let (state, shape) = self.run(&frame, |passes, to| {
             passes.forward(to);
-            if exposure.is_some() {
-                passes.expose(to, camera.width * camera.height);
+            let pixels = camera.width * camera.height;
+            if is_exposed {
+                passes.expose(to, pixels);
             }
-            passes.loss(to, exposure.is_some(), false);
+            if vignette.is_some() {
+                passes.dim(to, pixels);
+            }
+            passes.loss(to, is_exposed, false);
         })?;
         let loss = state.output().loss;
-        let image = self.rendering(camera.width, camera.height, exposure.is_some())?;
+        let image = self.rendering(camera.width, camera.height, is_exposed)?;
         let photograph = Photograph::from(input);
         let rendered = RenderedView { frame, shape, photograph };
         let points = if request.points == 0 {

@@ -233,6 +233,19 @@ impl<L> Passes<'_, L> {
         to.run(l.get("total_exposure"), [0; 4], 1);
     }
 
+    /// Dims an exposed image as the photograph's vignette does.
+    pub(super) fn dim(&self, to: &mut impl Record<L>, pixels: u32) {
+        to.run(self.launches.get("dim"), [0; 4], groups(pixels.into()) as u32);
+    }
+
+    /// Backpropagates the gradients of a dimmed image to those of the exposed one, and sums the derivatives with
+    /// respect to the vignette.
+    pub(super) fn dim_bwd(&self, to: &mut impl Record<L>, pixels: u32) {
+        let l = self.launches;
+        to.run(l.get("dim_bwd"), [0; 4], groups(pixels.into()) as u32);
+        to.run(l.get("total_vignette"), [0; 4], 1);
+    }
+
     /// Stage 4 of an image with or without an exposure. If `differentiates`, dL/dpixel replaces the image.
     pub(super) fn loss(&self, to: &mut impl Record<L>, is_exposed: bool, differentiates: bool) {
         let l = self.launches;

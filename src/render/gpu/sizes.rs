@@ -5,7 +5,7 @@ use wgpu::BufferUsages;
 
 use super::frame::{Frame, State, grid};
 use super::rows::{Content, Narrow, RowArray, row_arrays};
-use super::{exposure, pose};
+use super::{exposure, pose, vignette};
 use crate::Accumulation;
 use crate::cpu::BiasCorrection;
 use crate::signals::{Field, RecordLayout, SignalPlanes, counts_dominant};
@@ -74,10 +74,12 @@ pub(super) struct Sizes {
     pub(super) with_error: bool,
     /// True if pixels at edges have more weight.
     pub(super) with_edges: bool,
-    /// True if photographs have exposures.
+    /// True if photographs have exposures; vignettes need them, too.
     pub(super) exposures: bool,
     /// True if steps may differentiate the pose.
     pub(super) poses: bool,
+    /// True if photographs have vignettes.
+    pub(super) vignettes: bool,
     /// True if depth may be in the loss.
     pub(super) depth: bool,
 }
@@ -140,6 +142,7 @@ impl Sizes {
                 && needs.candidates.is_some_and(|r| r.error != ErrorMode::Gradient),
             exposures: false,
             poses: false,
+            vignettes: false,
             depth,
         }
     }
@@ -298,6 +301,12 @@ impl Sizes {
             let sums = pose::SUMS * (self.budget.total as u64).div_ceil(pose::GROUP);
             add(Section::Renderer, "gradient of the pose", "pose sums", sums);
             add(Section::Renderer, "gradient of the pose", "pose total", pose::SUMS);
+        }
+        if self.vignettes {
+            add(Section::Renderer, "vignette", "vignette", vignette::PARAMETERS);
+            let sums = vignette::SUMS * exposure::groups(pixels);
+            add(Section::Renderer, "vignette", "vignette sums", sums);
+            add(Section::Renderer, "vignette", "vignette total", vignette::SUMS);
         }
         add(Section::Images, "photograph on the device", "truth", 4 * pixels);
         add(Section::Images, "photograph on the device", "mask", pixels.next_multiple_of(4));

@@ -38,7 +38,7 @@ impl GpuBackend {
         input: &StepInput<'_>,
         trains: bool,
     ) -> Result<StepOutput, BackendError> {
-        let StepInput { camera, target, background, exposure, .. } = *input;
+        let StepInput { camera, target, background, exposure, vignette, .. } = *input;
         assert_same_size(camera, target);
         assert!(!input.pose || self.sizes.poses, "the backend was not made for poses");
         let start = Instant::now();
@@ -55,7 +55,7 @@ impl GpuBackend {
         } else {
             self.upload_target(target)
         };
-        self.load_exposure(&mut frame, exposure);
+        let is_exposed = self.load_camera(&mut frame, exposure, vignette);
         let depth = self.load_depth(&mut frame, input);
         let trained = self.sizes.budget.trained(self.rows).max(1) as f32;
         frame.add_step(input, trained, due, &self.planes);
@@ -85,11 +85,17 @@ impl GpuBackend {
                 let numbers = [distortion, least_inverse, weight, by_transmittance];
                 passes.depth_gradient(to, pixels, numbers);
             }
-            if exposure.is_some() {
+            if is_exposed {
                 passes.expose(to, pixels);
             }
-            passes.loss(to, exposure.is_some(), true);
-            if exposure.is_some() {
+            if vignette.is_some() {
+                passes.dim(to, pixels);
+            }
+            passes.loss(to, is_exposed, true);
+            if vignette.is_some() {
+                passes.dim_bwd(to, pixels);
+            }
+            if is_exposed {
                 passes.expose_bwd(to, pixels);
             }
         };
@@ -138,8 +144,9 @@ impl GpuBackend {
             self.stage_times = vec![("device", start.elapsed())];
         }
         let exposure = exposure.map(|exposure| self.exposure_gradient(exposure, background));
+        let vignette = vignette.map(|_| self.vignette_gradient());
         let given = input.depth.map(|_| state.depth);
         let pose = input.pose.then(|| pose::gradient(self.pose_sums));
-        Ok(StepOutput { exposure, pose, depth: given, ..state.output() })
+        Ok(StepOutput { exposure, vignette, pose, depth: given, ..state.output() })
     }
 }

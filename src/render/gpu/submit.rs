@@ -2,7 +2,7 @@
 
 use super::frame::{Frame, State};
 use super::passes::{Passes, Recorder, Shape};
-use super::{GpuBackend, exposure, pose, readback};
+use super::{GpuBackend, exposure, pose, readback, vignette};
 use crate::BackendError;
 
 impl GpuBackend {
@@ -33,6 +33,7 @@ impl GpuBackend {
             encoder.copy_buffer_to_buffer(self.buffers.get("state"), 0, staging, 0, state_bytes);
             let totals = [
                 (self.sizes.exposures, "exposure total", exposure::SUMS),
+                (self.sizes.vignettes, "vignette total", vignette::SUMS),
                 (self.sizes.poses, "pose total", pose::SUMS),
             ];
             let mut bytes = state_bytes;
@@ -47,6 +48,10 @@ impl GpuBackend {
             if self.sizes.exposures {
                 let (sums, others) = read.split_at(size_of_val(&self.exposure_sums));
                 (self.exposure_sums, read) = (bytemuck::pod_read_unaligned(sums), others);
+            }
+            if self.sizes.vignettes {
+                let (sums, others) = read.split_at(size_of_val(&self.vignette_sums));
+                (self.vignette_sums, read) = (bytemuck::pod_read_unaligned(sums), others);
             }
             if self.sizes.poses {
                 self.pose_sums = bytemuck::pod_read_unaligned(read);

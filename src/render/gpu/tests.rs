@@ -43,6 +43,7 @@ fn step(backend: &mut dyn Backend, camera: &Camera, target: &Image8) -> StepOutp
         background: BACKGROUND,
         exposure: None,
         pose: false,
+        vignette: None,
         depth: None,
         distortion: 0.0,
         sh_degree: 1,

@@ -190,6 +190,11 @@ pub(crate) fn learn_exposures(s: Spelling) -> String {
     format!("{} learns exposures anyway", s.text("exposure", "on"))
 }
 
+/// The hint on how to learn vignettes if the tracks do not show whether cameras have any.
+pub(crate) fn learn_vignettes(s: Spelling) -> String {
+    format!("{} learns vignettes anyway", s.text("vignette", "on"))
+}
+
 /// The line that names the budget and the reason for it. `most`: the maximum number of rows that the user gave, if any;
 /// `solved`: the memory limit if there is one, and true if it determines the number of rows.
 pub(crate) fn budget(

@@ -50,6 +50,8 @@ pub enum OptionProblem {
     UnusedInitPoints { points: usize },
     /// Test views are to be measured, but there are none.
     NothingToTest,
+    /// Vignettes are to be learned, but a view is one of several of its photograph.
+    VignetteOfDivided { view: String },
 }
 
 /// A size that is contradictory or does not fit.

@@ -241,6 +241,12 @@ impl OptionProblem {
                 s.set("init_points", points),
                 s.text("init", "random")
             ),
+            Self::VignetteOfDivided { view } => format!(
+                "{}: photographs are divided into several views, such as {view}, whose radii differ from the \
+                 photograph's; use {}, or photographs of a narrower lens",
+                s.text("vignette", "on"),
+                s.text("vignette", "off")
+            ),
             Self::NothingToTest => format!(
                 "{}: no view is held out to measure; add {} or {}",
                 s.option("test_iterations"),

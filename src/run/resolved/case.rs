@@ -13,6 +13,7 @@ use super::fit::RunSize;
 use super::inputs::{Evidence, Inputs, Reading, choose_moments, open_device};
 use super::poses::RefinedPoses;
 use super::size::MIN_ROWS;
+use super::vignette::CameraVignettes;
 use crate::failure::{Failure, ModelProblem, OptionProblem, SizeProblem};
 use crate::host::Host;
 use crate::near_plane::NearPlane;
@@ -28,6 +29,7 @@ use densify_train::exposure::ExposureChoice;
 use densify_train::poses::PoseChoice;
 use densify_train::schedule::Background;
 use densify_train::trainer::{AutoChoices, FLOATER_BYTES, floater_request, growth_signals};
+use densify_train::vignette::VignetteChoice;
 
 /// Maximum number of random initial points without `--init-points` (Kerbl et al. 2023 use 100,000).
 const RANDOM_POINTS: usize = 100_000;
@@ -57,6 +59,7 @@ pub(crate) struct Choices {
     pub(crate) degree: Degree,
     pub(crate) exposure: Exposure,
     pub(crate) poses: RefinedPoses,
+    pub(crate) vignette: CameraVignettes,
     pub(crate) antialiasing: Antialiasing,
     pub(crate) near: NearPlane,
     pub(crate) position_rates: PositionRates,
@@ -81,8 +84,8 @@ impl Choices {
     /// Messages about the choices that depend on the scene.
     pub(super) fn lines(&self, spec: &RunSpec, spelling: Spelling) -> impl Iterator<Item = String> {
         let depths = self.near.line(spelling).into_iter().chain(self.position_rates.line());
-        let colours = self.degree.line().into_iter().chain(self.exposure.line(spelling));
-        depths.chain(colours).chain(self.poses.line(spec, spelling))
+        let light = self.exposure.line(spelling).into_iter().chain(self.vignette.line(spelling));
+        depths.chain(self.degree.line()).chain(light).chain(self.poses.line(spec, spelling))
     }
 }
 
@@ -90,6 +93,7 @@ impl Choices {
 struct Decisions {
     degree: Degree,
     exposure: Exposure,
+    vignette: CameraVignettes,
     poses: RefinedPoses,
 }
 
@@ -98,17 +102,21 @@ impl<'a> Case<'a> {
     pub(super) fn for_new_run(spec: &'a RunSpec, host: Host<'_>) -> Result<Self, Failure> {
         let may_learn_exposures = spec.schedule.exposure != ExposureChoice::Off;
         let may_refine = spec.schedule.poses != PoseChoice::Fixed;
+        let may_learn_vignettes = spec.schedule.vignette != VignetteChoice::Off;
         let reading = Reading {
             tracks: spec.size.sh_degree == Some(ShDegree::Auto(None))
                 || may_learn_exposures
+                || may_learn_vignettes
                 || may_refine,
             colours: true,
             exif: may_learn_exposures,
+            vignettes: may_learn_vignettes,
             ..Reading::default()
         };
         Self::open(spec, &reading, host, |evidence, views| Decisions {
             degree: Degree::decide(spec, None, evidence),
             exposure: Exposure::decide(spec, evidence),
+            vignette: CameraVignettes::decide(spec, evidence),
             poses: RefinedPoses::decide(spec, evidence, views),
         })
     }
@@ -122,13 +130,15 @@ impl<'a> Case<'a> {
     ) -> Result<Self, Failure> {
         let decides_exposures = spec.schedule.exposure != ExposureChoice::Off && !has_checkpoint;
         let decides_poses = spec.schedule.poses != PoseChoice::Fixed && !has_checkpoint;
+        let decides_vignettes = spec.schedule.vignette != VignetteChoice::Off && !has_checkpoint;
         let findings = &saved.resolved;
         let reading = Reading {
             // A checkpoint contains the rows of both models, so their files may no longer exist.
             models: Some([findings.init_model, findings.frozen]),
-            tracks: decides_exposures || decides_poses,
+            tracks: decides_exposures || decides_vignettes || decides_poses,
             colours: true,
             exif: decides_exposures,
+            vignettes: decides_vignettes,
             depth: Some(findings.depth.is_some()),
             tolerance: RESUME_TOLERANCE,
         };
@@ -138,6 +148,11 @@ impl<'a> Case<'a> {
                 Exposure::known(findings.has_exposures, findings.exposure_from)
             } else {
                 Exposure::decide(spec, evidence)
+            },
+            vignette: if has_checkpoint {
+                CameraVignettes::known(findings.has_vignettes, findings.vignette_from)
+            } else {
+                CameraVignettes::decide(spec, evidence)
             },
             poses: if has_checkpoint {
                 RefinedPoses::known(findings.refines_poses, findings.poses_from)
@@ -154,12 +169,18 @@ impl<'a> Case<'a> {
         host: Host<'_>,
     ) -> Result<Self, Failure> {
         let has_exposures = spec.schedule.exposure != ExposureChoice::Off;
+        let has_vignettes = spec.schedule.vignette != VignetteChoice::Off;
         let refines_poses = spec.schedule.poses != PoseChoice::Fixed;
-        let tracks = has_exposures || refines_poses;
-        let reading = Reading { models: Some(models), tracks, ..Reading::default() };
+        let reading = Reading {
+            models: Some(models),
+            tracks: has_exposures || has_vignettes || refines_poses,
+            vignettes: has_vignettes,
+            ..Reading::default()
+        };
         let mut case = Self::open(spec, &reading, host, |evidence, _| Decisions {
             degree: Degree::decide(spec, None, evidence),
             exposure: Exposure::known(has_exposures, super::ExposureSource::Given),
+            vignette: CameraVignettes::known(has_vignettes, super::VignetteSource::Given),
             poses: RefinedPoses::known(refines_poses, super::PoseSource::Given),
         })?;
         if case.inputs.device.adapter().is_none() {
@@ -180,7 +201,9 @@ impl<'a> Case<'a> {
         check_automatic(spec)?;
         let device = open_device(spec, &mut knobs, host.observer)?;
         let (inputs, evidence) = Inputs::open(spec, device, reading, host)?;
-        let Decisions { degree, exposure, poses } = decide(&evidence, &inputs.dataset.train);
+        let Decisions { degree, exposure, vignette, poses } =
+            decide(&evidence, &inputs.dataset.train);
+        vignette.check(&inputs.dataset)?;
         drop(evidence);
         for note in &exposure.notes {
             host.observer.say(format_args!("note: {note}"));
@@ -199,6 +222,7 @@ impl<'a> Case<'a> {
             degree,
             exposure,
             poses,
+            vignette,
             antialiasing: antialiasing(spec, &inputs)?,
             near: NearPlane::from_depths(spec.start.near, &seen),
             position_rates: PositionRates::choose(spec, &seen),

@@ -18,6 +18,7 @@ use densify_core::files::{FileError, write_atomically};
 use densify_data::dataset::{DepthFinding, is_archive};
 use densify_data::track_colours::Spread;
 use densify_data::track_colours::exposures::ExposureSpread;
+use densify_data::track_colours::vignettes::VignetteSpread;
 use densify_data::track_poses::PoseErrors;
 use densify_train::output::{CONFIG_FILE, FolderError};
 
@@ -66,6 +67,12 @@ pub struct Findings {
     /// True if poses are refined.
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub refines_poses: bool,
+    /// The reason for learning vignettes or not.
+    #[serde(skip_serializing_if = "VignetteSource::is_given")]
+    pub vignette_from: VignetteSource,
+    /// True if vignettes are learned.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub has_vignettes: bool,
     /// The model that the run started from.
     pub init_model: Option<ModelSize>,
     /// The model whose Gaussians never change.
@@ -125,6 +132,26 @@ pub enum PoseSource {
 
 impl PoseSource {
     fn is_given(&self) -> bool {
+        *self == Self::Given
+    }
+}
+
+/// The reason for learning a vignette for each camera, or not.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum VignetteSource {
+    /// The options.
+    #[default]
+    Given,
+    /// The colours of tracks, before training, of the camera with the clearest evidence.
+    Tracks(VignetteSpread),
+    /// No evidence: too few tracks are seen at different radii, so vignettes are not learned.
+    Undecided,
+}
+
+impl VignetteSource {
+    /// True if the options decided.
+    pub fn is_given(&self) -> bool {
         *self == Self::Given
     }
 }
@@ -204,6 +231,8 @@ impl RunConfig {
             has_exposures: choices.exposure.is_on,
             poses_from: choices.poses.source,
             refines_poses: choices.poses.is_on,
+            vignette_from: choices.vignette.source,
+            has_vignettes: choices.vignette.is_on,
             init_model: inputs.init_model,
             frozen: inputs.frozen_model,
             depth: inputs.dataset.depth.clone(),

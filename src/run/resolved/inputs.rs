@@ -8,12 +8,14 @@ use crate::spec::knobs::Knobs;
 use crate::spec::{AbsolutePath, InitChoice, RunSpec, StartSpec};
 use densify_data::dataset::images::ImageDemand;
 use densify_data::dataset::{Dataset, ReportedExposures, Tracks, View};
+use densify_data::track_colours::vignettes;
 use densify_data::track_colours::{self, MIN_TRACKS, TrackColours};
 use densify_render::{Accumulation, BackendKind, Device};
 use densify_train::init::usable_points;
 
 use super::config::ModelSize;
 use super::models::{file_of, size_of_model};
+use super::vignette::VignetteEvidence;
 
 /// Everything that a run reads and runs on.
 #[derive(Clone)]
@@ -49,6 +51,8 @@ pub(super) struct Evidence {
     pub(super) colours: Option<TrackColours>,
     /// Exposures in EXIF.
     pub(super) reported: ReportedExposures,
+    /// Vignettes of the cameras.
+    pub(super) vignettes: VignetteEvidence,
 }
 
 /// The evidence to read in addition to the dataset, and the sizes of models if they are known.
@@ -62,6 +66,8 @@ pub(super) struct Reading {
     pub(super) colours: bool,
     /// Read the exposures in EXIF.
     pub(super) exif: bool,
+    /// Measure the vignettes of the cameras.
+    pub(super) vignettes: bool,
     /// The decision about depth that an earlier session of the run has taken.
     pub(super) depth: Option<bool>,
     /// Resident memory that is not counted `[bytes]`, so that a resumed run is not refused because its process takes a
@@ -102,10 +108,15 @@ impl Inputs {
         let peak = (host.process.peak)();
         let tracks = std::mem::take(&mut dataset.tracks);
         let has_colours = reading.colours && tracks.count() >= MIN_TRACKS;
-        let colours =
+        let mut colours =
             has_colours.then(|| TrackColours::read(&tracks, &dataset.train)).transpose()?;
-        let track_bytes =
+        let mut track_bytes =
             if reading.tracks { tracks.bytes() + track_colours::bytes(&tracks) } else { 0 };
+        let mut of_vignettes = VignetteEvidence::default();
+        if reading.vignettes {
+            track_bytes += vignettes::bytes(&tracks);
+            of_vignettes = VignetteEvidence::measure(&tracks, colours.as_mut(), &dataset.train);
+        }
         let reported = reading.exif.then(|| ReportedExposures::read(&dataset.train));
         let reported = reported.unwrap_or_default();
         let inputs = Self {
@@ -122,7 +133,7 @@ impl Inputs {
             peak,
             companion: host.companion,
         };
-        Ok((inputs, Evidence { tracks, colours, reported }))
+        Ok((inputs, Evidence { tracks, colours, reported, vignettes: of_vignettes }))
     }
 
     /// The same inputs with the photographs at the resolution of `spec`.

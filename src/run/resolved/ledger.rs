@@ -22,6 +22,7 @@ use densify_train::exposure::Exposures;
 use densify_train::metrics::{geometry, scratch_bytes};
 use densify_train::poses::Poses;
 use densify_train::trainer::AutoChoices;
+use densify_train::vignette::Vignettes;
 
 /// Memory of the program itself `[bytes]`: the code pages in use, and the stacks of its threads. Measured at 15 to 17
 /// MiB, and at up to 20 MiB in builds for tests (profile `dev`): it varies with what the system has mapped already.
@@ -63,6 +64,7 @@ impl Case<'_> {
             needs,
             exposures: self.choices.exposure.is_on,
             poses: self.choices.poses.is_on,
+            vignettes: self.choices.vignette.is_on,
             depth: self.has_depth(),
             ..Setup::default()
         }
@@ -128,6 +130,14 @@ impl Case<'_> {
         if poses > 0 {
             ledger.add_to(Section::Model, "poses of the views", poses);
         }
+        let vignettes = if self.choices.vignette.is_on {
+            Vignettes::bytes(self.inputs.dataset.train.len())
+        } else {
+            0
+        };
+        if vignettes > 0 {
+            ledger.add_to(Section::Model, "vignettes of the cameras", vignettes);
+        }
         if self.inputs.track_bytes > 0 {
             let bytes = self.inputs.track_bytes + train.held(0) + train.decoding(1);
             ledger.add_to(Section::Before, "colours of tracks", bytes);
@@ -158,10 +168,8 @@ impl Case<'_> {
                 ..Frame::WORLD
             },
         });
-        pass(
-            "export of the model, checkpoint",
-            2 * piece * row + held + STATE_TEXT * (exposures + poses),
-        );
+        let text = STATE_TEXT * (exposures + vignettes + poses);
+        pass("export of the model, checkpoint", 2 * piece * row + held + text);
         if let Some(companion) = self.inputs.companion {
             let sizes = CompanionSize {
                 budget,

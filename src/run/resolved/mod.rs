@@ -20,11 +20,14 @@ mod size;
 #[cfg(test)]
 mod tests;
 mod training;
+mod vignette;
 
 pub(crate) use case::{Case, DECODERS, Init, TEST_DECODERS};
 #[cfg(test)]
 pub(crate) use config::tests::sample;
-pub use config::{DegreeSource, ExposureSource, Findings, ModelSize, PoseSource, RunConfig};
+pub use config::{
+    DegreeSource, ExposureSource, Findings, ModelSize, PoseSource, RunConfig, VignetteSource,
+};
 pub(crate) use coordinates::random_points;
 pub use estimate::{estimate, host_bytes};
 pub(crate) use fit::RunSize;
@@ -65,7 +68,7 @@ impl<'a> ResolvedRun<'a> {
     }
 
     /// Resolves a resumed run with the choices of `saved`. `spec` is the saved description overlaid with the options
-    /// given now. Only a checkpoint contains the exposures; without it, the initial exposures are determined again.
+    /// given now. Only a checkpoint contains the exposures and vignettes; without it, the initial ones are determined again.
     ///
     /// # Errors
     /// As [`for_new_run`](Self::for_new_run).

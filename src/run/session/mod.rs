@@ -35,11 +35,14 @@ use densify_train::output::{
     write_json, write_scores,
 };
 use densify_train::trainer::{StepReport, TrainError};
+use densify_train::vignette::named_vignettes;
 use geometry::measure;
 use records::{Logs, Totals};
 
 /// The file beside a model with the exposures of the training views.
 const EXPOSURES: &str = "exposure.json";
+/// The file beside a model with the vignettes of the cameras.
+const VIGNETTES: &str = "vignette.json";
 /// Steps between two records of the log.
 const RECORD_EVERY: u32 = 10;
 
@@ -389,6 +392,11 @@ impl<'a> Session<'a> {
             let names = self.run.dataset.train.iter().map(|view| &*view.name);
             let named = named_transforms(exposures, names);
             write_json(&path.with_file_name(EXPOSURES), &named)?;
+        }
+        if let Some(vignettes) = &self.run.trainer.progress().vignettes {
+            let names = self.run.dataset.train.iter().map(|view| &*view.name);
+            let named = named_vignettes(vignettes, names);
+            write_json(&path.with_file_name(VIGNETTES), &named)?;
         }
         Ok(path)
     }

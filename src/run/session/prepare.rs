@@ -88,6 +88,7 @@ pub(super) fn prepare(
     let exposures = case.choices.exposure.initial(spec, &case.inputs.dataset);
     let extent = training.scene.extent;
     let poses = case.choices.poses.initial(spec, &case.inputs.dataset, extent);
+    let vignettes = case.choices.vignette.initial(&case.inputs.dataset);
     let (name, automatic) = (case.choices.entry.name, case.choices.automatic);
     let mut dataset = case.inputs.into_owned().dataset;
     let views = DatasetViews::new(dataset.train.clone(), size.image_cache, DECODERS);
@@ -98,8 +99,8 @@ pub(super) fn prepare(
         .map_or_else(PointCloud::default, |companion| dataset.points.thinned(companion.points));
     let ResolvedTraining { policy, scene, .. } = training;
     let trainer = Trainer::new(views, backend, (name, policy), scene, options)?;
-    let mut trainer =
-        trainer.with_auto_choices(automatic).with_exposures(exposures).with_poses(poses);
+    let trainer = trainer.with_auto_choices(automatic).with_exposures(exposures);
+    let mut trainer = trainer.with_vignettes(vignettes).with_poses(poses);
     let session = match resumed {
         Some(resumed) => resume::restore(resumed, &mut trainer, observer)?,
         None => None,

@@ -5,7 +5,7 @@ use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 
-use crate::resolved::{DegreeSource, ExposureSource, PoseSource, RunConfig};
+use crate::resolved::{DegreeSource, ExposureSource, PoseSource, RunConfig, VignetteSource};
 use densify_core::files::FileError;
 use densify_core::gaussians::MAX_SH_DEGREE;
 use densify_core::numbers::counted;
@@ -14,6 +14,7 @@ use densify_data::dataset::DepthFinding;
 use densify_render::DepthTerm;
 use densify_train::output::read_json;
 use densify_train::trainer::{Annealed, AutoBudget, MIN_GAIN};
+use densify_train::vignette::{VignetteChoice, Vignettes};
 
 /// Path within the folder of the run.
 pub(super) const REQUIREMENTS: &str = "stats/requirements.json";
@@ -35,6 +36,9 @@ pub struct Requirements {
     pub poses: bool,
     /// The reason for refining poses or not.
     pub poses_from: PoseSource,
+    /// The vignettes, unless the options left them off.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub vignettes: Option<VignetteUse>,
     /// Measurements of `--budget auto`.
     pub rows: Option<AutoBudget>,
     /// Number of training views not rendered for scores because of near-duplicates.
@@ -56,6 +60,17 @@ pub struct DepthUse {
     pub term: DepthTerm,
     /// Weight of the term, at the first and at the last iteration.
     pub weight: Annealed,
+}
+
+/// The choice to learn vignettes or not, and the light that cameras lose.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct VignetteUse {
+    /// True if a vignette was learned for each camera.
+    pub learned: bool,
+    /// The reason for it.
+    pub from: VignetteSource,
+    /// The light that each camera loses at the corner of a 4:3 photograph, as learned `[stops]`.
+    pub corner_stops: Vec<f64>,
 }
 
 /// The reductions in a `stats/requirements.json`.
@@ -95,11 +110,13 @@ impl Requirements {
         rows: usize,
         auto_budget: Option<&AutoBudget>,
         unscored_views: usize,
+        vignettes: Option<&Vignettes>,
     ) -> Self {
         let left_out = [
             degree_left_out(config),
             exposures_left_out(config),
             poses_left_out(config),
+            vignettes_left_out(config),
             auto_budget.and_then(|auto| rows_left_out(auto, rows, config.budget)),
             auto_budget.and_then(rows_removed),
             (unscored_views > 0).then(|| unscored(unscored_views)),
@@ -112,6 +129,17 @@ impl Requirements {
             exposures_from: config.resolved.exposure_from,
             poses: config.resolved.refines_poses,
             poses_from: config.resolved.poses_from,
+            vignettes: (config.spec.schedule.vignette != VignetteChoice::Off).then(|| {
+                VignetteUse {
+                    learned: config.resolved.has_vignettes,
+                    from: config.resolved.vignette_from,
+                    corner_stops: vignettes
+                        .map(Vignettes::corner_stops)
+                        .into_iter()
+                        .flatten()
+                        .collect(),
+                }
+            }),
             rows: auto_budget.cloned(),
             unscored_views,
             depth: config.resolved.depth.clone().and_then(|given| {
@@ -127,14 +155,16 @@ impl Requirements {
         let depth = self.depth.as_ref().map(|depth| {
             format!("trained on depth with weight {}: {}", depth.weight, depth.given.describe())
         });
+        let vignettes = self.vignettes.as_ref().and_then(VignetteUse::line);
+        let uses = depth.into_iter().chain(vignettes);
         if self.left_out.is_empty() {
             let full = spelling.switch("full");
             let why = if self.full { format!(" ({full})") } else { String::new() };
-            return std::iter::once(format!("left out nothing{why}")).chain(depth).collect();
+            return std::iter::once(format!("left out nothing{why}")).chain(uses).collect();
         }
         let line =
             |left: &LeftOut| format!("left out {}: {}; {}", left.what, left.evidence, left.loss);
-        self.left_out.iter().map(line).chain(depth).collect()
+        self.left_out.iter().map(line).chain(uses).collect()
     }
 }
 
@@ -196,6 +226,35 @@ fn poses_left_out(config: &RunConfig) -> Option<LeftOut> {
     })
 }
 
+impl VignetteUse {
+    /// The light that the cameras lose, in a line; `None` if no vignettes were learned.
+    fn line(&self) -> Option<String> {
+        let least = self.corner_stops.iter().copied().reduce(f64::min)?;
+        let most = self.corner_stops.iter().copied().reduce(f64::max)?;
+        let cameras = counted(self.corner_stops.len(), "camera");
+        let range = if self.corner_stops.len() > 1 {
+            format!("{least:.2} to {most:.2}")
+        } else {
+            format!("{most:.2}")
+        };
+        Some(format!(
+            "vignettes learned: {cameras}, {range} stops at the corner of a 4:3 photograph"
+        ))
+    }
+}
+
+fn vignettes_left_out(config: &RunConfig) -> Option<LeftOut> {
+    let VignetteSource::Tracks(spread) = config.resolved.vignette_from else { return None };
+    (!config.resolved.has_vignettes).then(|| LeftOut {
+        what: "a vignette for each camera".to_owned(),
+        evidence: format!(
+            "judged by the colours of {} points at different radii, {:.2} ± {:.2} stops are lost towards the corners",
+            spread.tracks, spread.stops, spread.error
+        ),
+        loss: "the cost in quality was not measured".to_owned(),
+    })
+}
+
 fn rows_left_out(auto: &AutoBudget, rows: usize, budget: usize) -> Option<LeftOut> {
     let last = auto.intervals.iter().find(|interval| Some(interval.step) == auto.stopped)?;
     let gain = last.gain.filter(|_| rows < budget && auto.idle >= 2)?;
@@ -249,7 +308,9 @@ mod tests {
     fn reductions_by_options_are_not_reported() {
         let mut config = sample();
         let lines = |config: &RunConfig, unscored| {
-            Requirements::new(config, 500, None, unscored).lines(Spelling::Terminal).join("\n")
+            Requirements::new(config, 500, None, unscored, None)
+                .lines(Spelling::Terminal)
+                .join("\n")
         };
         config.resolved.sh_degree_from = DegreeSource::Given;
         config.sh_degree = 0;
@@ -266,7 +327,9 @@ mod tests {
     fn each_reduction_has_its_evidence_and_its_loss() {
         let mut config = sample();
         let line = |config: &RunConfig, auto_budget: Option<&AutoBudget>| {
-            Requirements::new(config, 900, auto_budget, 0).lines(Spelling::Terminal).join("\n")
+            Requirements::new(config, 900, auto_budget, 0, None)
+                .lines(Spelling::Terminal)
+                .join("\n")
         };
         config.resolved.sh_degree_from = DegreeSource::Spread(spread());
         config.sh_degree = 0;

@@ -51,7 +51,8 @@ impl Session<'_> {
     fn requirements(&self) -> Requirements {
         let Run { config, trainer, .. } = &self.run;
         let growth = trainer.progress().auto_budget.as_ref();
-        Requirements::new(config, trainer.rows(), growth, trainer.unscored_views())
+        let vignettes = trainer.progress().vignettes.as_ref();
+        Requirements::new(config, trainer.rows(), growth, trainer.unscored_views(), vignettes)
     }
 
     /// Tells the user the result in a few lines.

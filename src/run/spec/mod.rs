@@ -35,6 +35,7 @@ use densify_train::exposure::{ExposureChoice, ExposureModel};
 use densify_train::poses::PoseChoice;
 use densify_train::schedule::{Background, InitRates, REFERENCE_ITERATIONS};
 use densify_train::trainer::{Annealed, OnNan};
+use densify_train::vignette::VignetteChoice;
 use values::as_table;
 
 /// Rule for changing an option of a resumed run.
@@ -347,6 +348,10 @@ run_spec! {
 
         /// With refined poses, adjust the focal length of each lens by the points as well
         refine_focal: bool = false, Fixed, switch Set;
+
+        /// Learn a vignette for each camera: the light that its photographs lose towards their edges. Test views are
+        /// measured without it. auto needs the tracks of a reconstruction
+        vignette: VignetteChoice = VignetteChoice::Off, Fixed, value "WHEN";
 
         /// Treatment of Gaussians with a non-finite value; the model is checked at least every 100 iterations
         on_nan: OnNan = OnNan::Prune, Free, value "ACTION";

@@ -27,6 +27,7 @@ use densify_run::{
     estimate, say_notes,
 };
 use densify_train::exposure::ExposureChoice;
+use densify_train::vignette::VignetteChoice;
 
 /// Minimum number of Gaussians of a block.
 const MIN_ROWS: usize = 100;
@@ -119,6 +120,12 @@ impl<'a> Planner<'a> {
         if spec.schedule.exposure == ExposureChoice::Auto {
             return Err(Failure::input(
                 "--exposure auto: each block would decide for itself, and the blocks of a model must agree; give on \
+                 or off",
+            ));
+        }
+        if spec.schedule.vignette == VignetteChoice::Auto {
+            return Err(Failure::input(
+                "--vignette auto: each block would decide for itself, and the blocks of a model must agree; give on \
                  or off",
             ));
         }

@@ -110,6 +110,11 @@ pub fn compress(options: &Options<'_>, observer: &dyn Observer) -> Result<Compre
             "exposure learned again, as in the run; PSNR is measured with the best exposure of each photograph"
         ));
     }
+    if options.model.vignette {
+        observer.say(format_args!(
+            "vignette learned again, as in the run; PSNR is measured without it"
+        ));
+    }
     let original = read_model_as(&options.model.file, options.antialias, observer)?;
     let model = in_fine_coordinates(original);
     fit::check(options, &model)?;

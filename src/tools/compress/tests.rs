@@ -46,6 +46,7 @@ fn options<'a>(to: Target, scene: &Path, formats: &'a [&'static Format]) -> Opti
             depth: DepthSpec::default(),
             exposure: None,
             poses: Default::default(),
+            vignette: false,
             near: None,
         },
         antialias: None,

@@ -215,6 +215,7 @@ pub(super) fn step(
         background,
         exposure: None,
         pose: false,
+        vignette: None,
         depth: None,
         distortion: 0.0,
         sh_degree,

@@ -6,6 +6,7 @@
 //!   cameras.json                                 all cameras, in the coordinates of the saved model
 //!   point_cloud/iteration_N/point_cloud.ply      the model
 //!   point_cloud/iteration_N/exposure.json        exposures of the training views
+//!   point_cloud/iteration_N/vignette.json        vignettes of the cameras
 //!   checkpoints/iteration_N.safetensors          state for continuing the run
 //!   stats/train.jsonl  events.jsonl  summary.json  requirements.json
 //!   results.json  per_view.json                  test scores in the format of the original trainer

@@ -36,6 +36,7 @@ pub fn fitted_camera(
             target: photograph,
             background,
             exposure: None,
+            vignette: None,
             pose: true,
             depth: None,
             distortion: 0.0,

@@ -30,9 +30,12 @@ use densify_policies::policy::{
 use crate::exposure::Exposures;
 use crate::poses::Poses;
 use crate::schedule;
+use crate::vignette::Vignettes;
 pub use auto_budget::{AutoBudget, Interval, MIN_GAIN, Removal, growth_signals};
+use densify_core::camera::Camera;
 use densify_core::image::SharedImage;
 use densify_core::image::depth::SharedDepth;
+use densify_core::vignette::Vignette;
 use densify_data::views::{ViewError, ViewSource};
 use densify_render::{Backend, StepInput};
 use depth::distortion;
@@ -149,6 +152,25 @@ impl<V: ViewSource> Trainer<V> {
         self
     }
 
+    /// Enables learning of vignettes, with their initial values; call it before the first step. The backend must have
+    /// been created for vignettes.
+    ///
+    /// # Panics
+    /// When the numbers of views differ, which is a bug in the caller.
+    #[must_use]
+    pub fn with_vignettes(mut self, vignettes: Option<Vignettes>) -> Self {
+        let count = vignettes.as_ref().map_or(self.views.count(), Vignettes::count);
+        assert_eq!(count, self.views.count(), "the vignettes are for another number of views");
+        self.state.vignettes = vignettes;
+        self
+    }
+
+    /// The vignette of a view that is rendered with `camera`, if vignettes are learned.
+    fn vignette(&self, view: usize, camera: &Camera) -> Option<Vignette> {
+        let vignettes = self.state.vignettes.as_ref()?;
+        Some(vignettes.of_view(view, self.views.camera(view), camera))
+    }
+
     /// One iteration: a view, a gradient step, and the policy's edit if it is due.
     ///
     /// May be called beyond [`TrainOptions::iterations`]; step sizes then keep their final values.
@@ -172,6 +194,7 @@ impl<V: ViewSource> Trainer<V> {
         let progress = f64::from(step) / f64::from(iterations);
         let depth = self.options.depth.zip(depth.as_deref());
         let exposure = self.state.exposures.as_ref().map(|exposures| exposures.transform(view));
+        let vignette = self.vignette(view, &camera);
         let input = StepInput {
             step,
             view,
@@ -180,6 +203,7 @@ impl<V: ViewSource> Trainer<V> {
             background: background.at(seed, step),
             exposure: exposure.as_ref(),
             pose: self.state.poses.is_some(),
+            vignette: vignette.as_ref(),
             depth: depth.and_then(|(training, map)| training.target(map, progress)),
             distortion: distortion(self.options.distortion, progress),
             sh_degree: self.sh_degree(step),
@@ -199,6 +223,9 @@ impl<V: ViewSource> Trainer<V> {
             exposures.step(view, &gradient, progress);
         }
         self.move_pose(step, view, &output, progress);
+        if let Some((vignettes, gradient)) = self.state.vignettes.as_mut().zip(output.vignette) {
+            vignettes.step(view, &gradient, progress);
+        }
         let is_due = self.ask_policy(step, |policy| policy.is_due(step))?;
         let mut events = Vec::new();
         if is_due || step.is_multiple_of(AUDIT_EVERY) || step == iterations {

@@ -36,6 +36,7 @@ impl<V: ViewSource> Trainer<V> {
     ) -> Result<AuxOutput, TrainError> {
         let (image, depth) = self.image_with_depth(step, view)?;
         let exposure = self.state.exposures.as_ref().map(|exposures| exposures.transform(view));
+        let vignette = self.vignette(view, self.views.camera(view));
         let (options, sh_degree) = (self.options, self.sh_degree(step));
         let camera = self.camera(view);
         let measured = self.backend.observe(&AuxInput {
@@ -46,6 +47,7 @@ impl<V: ViewSource> Trainer<V> {
             target: &image,
             background: options.background.at(options.seed, step),
             exposure: exposure.as_ref(),
+            vignette: vignette.as_ref(),
             sh_degree,
             depth: depth.as_deref(),
             request,

@@ -12,6 +12,7 @@ use super::{AutoBudget, EditEvent, Trainer};
 use crate::exposure::Exposures;
 use crate::poses::Poses;
 use crate::schedule;
+use crate::vignette::Vignettes;
 use densify_data::views::ViewSource;
 
 /// The state of a [`Trainer`] between two steps, without that of the backend.
@@ -43,6 +44,9 @@ pub struct TrainerState {
     /// Poses of the training views, if they are refined.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub poses: Option<Poses>,
+    /// Vignettes of the cameras, if they are learned.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub vignettes: Option<Vignettes>,
 }
 
 impl<V: ViewSource> Trainer<V> {
@@ -58,8 +62,8 @@ impl<V: ViewSource> Trainer<V> {
     /// have the model and the backend state of the same step.
     ///
     /// # Errors
-    /// [`PolicyError`] if the policy rejects its state, or if the exposures do not match. After an error the trainer
-    /// must not be used.
+    /// [`PolicyError`] if the policy rejects its state, or if the exposures or vignettes do not match. After an error the
+    /// trainer must not be used.
     pub fn resume(&mut self, mut state: TrainerState) -> Result<(), PolicyError> {
         let policy = std::mem::take(&mut state.policy);
         call_policy(|| self.policy.restore(policy)).flatten()?;
@@ -73,6 +77,12 @@ impl<V: ViewSource> Trainer<V> {
             (Some(saved), Some(own)) => saved.check_matches(own),
             (None, None) => Ok(()),
             _ => Err("either the checkpoint or this run refines poses, but not both".to_owned()),
+        };
+        matches.map_err(PolicyError::Other)?;
+        let matches = match (&state.vignettes, &self.state.vignettes) {
+            (Some(saved), Some(own)) => saved.check_matches(own),
+            (None, None) => Ok(()),
+            _ => Err("either the checkpoint or this run has vignettes, but not both".to_owned()),
         };
         matches.map_err(PolicyError::Other)?;
         self.scene.initial_rows = state.initial_rows;

@@ -166,6 +166,7 @@ fn a_signal_stops_between_any_two_views() {
             depth: DepthSpec::default(),
             exposure: None,
             poses: (densify::train::poses::PoseChoice::Fixed, false),
+            vignette: false,
             near: None,
         },
         antialias: None,

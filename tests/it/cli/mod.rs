@@ -39,6 +39,7 @@ mod resuming;
 mod trading;
 mod training;
 mod view_server;
+mod vignetting;
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};

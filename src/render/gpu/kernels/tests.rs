@@ -136,6 +136,7 @@ fn largest_sizes(formats: Formats) -> Sizes {
     sizes.photographs = KeptPhotographs { count: 1, with_masks: true };
     sizes.exposures = true;
     sizes.poses = true;
+    sizes.vignettes = true;
     sizes
 }
 

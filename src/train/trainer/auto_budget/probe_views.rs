@@ -50,6 +50,13 @@ impl<V: ViewSource> Trainer<V> {
                     *colour = exposure.apply(*colour);
                 }
             }
+            if let Some(vignette) = self.vignette(view, self.views.camera(view)) {
+                let width = image.width as usize;
+                for (i, colour) in rendering.rgb.as_chunks_mut::<3>().0.iter_mut().enumerate() {
+                    let (x, y) = (i % width, i / width);
+                    *colour = vignette.apply(x, y, image.alpha_at(x, y), *colour);
+                }
+            }
             let ratio = psnr(&rendering.rgb, &image, background).map_err(|source| {
                 let view = self.views.name(view).to_owned();
                 TrainError::View { step, view, source: Box::new(source) }
