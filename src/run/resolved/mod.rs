@@ -25,7 +25,7 @@ pub(crate) use case::{Case, DECODERS, Init, TEST_DECODERS};
 pub(crate) use config::tests::sample;
 pub use config::{DegreeSource, ExposureSource, Findings, ModelSize, RunConfig};
 pub(crate) use coordinates::random_points;
-pub use estimate::{estimate, host_bytes};
+pub use estimate::{Extent, estimate, extent};
 pub(crate) use fit::RunSize;
 pub(crate) use geometry_measurement::GeometryMeasurement;
 pub(crate) use models::{importance_setup, read};

@@ -37,6 +37,18 @@ impl Journal {
         self.outcomes.iter().rev().find(|run| run.is_of(spec))
     }
 
+    /// All outcomes, in the order in which the runs ended.
+    pub(super) fn outcomes(&self) -> impl Iterator<Item = &Outcome> + Clone {
+        self.outcomes.iter()
+    }
+
+    /// A finished run of this version of densify that has this name, but another description.
+    pub(super) fn other_run(&self, name: &str, spec: &Partial) -> Option<&Outcome> {
+        let is_current = |run: &&Outcome| run.densify == env!("CARGO_PKG_VERSION");
+        let last = self.outcomes.iter().rev().filter(is_current).find(|run| run.run == name);
+        last.filter(|run| !run.is_of(spec))
+    }
+
     /// Adds an outcome and writes the file.
     pub(super) fn add(&mut self, outcome: Outcome) -> Result<(), FileError> {
         self.outcomes.push(outcome);
