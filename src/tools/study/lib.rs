@@ -146,6 +146,11 @@ impl<'a> Study<'a> {
         self.journal.outcome(&run.spec)
     }
 
+    /// Estimated time of the unfinished runs, one after another `[s]`.
+    fn seconds_of(&mut self, runs: &[PlannedRun]) -> Result<f64, Failure> {
+        Ok(self.plan(runs)?.iter().map(Set::seconds).sum())
+    }
+
     /// The unfinished runs with their estimated times, in the order of training.
     fn plan(&mut self, runs: &[PlannedRun]) -> Result<Vec<Set>, Failure> {
         let mut timed: Vec<(PlannedRun, f64)> = Vec::new();
@@ -164,16 +169,18 @@ impl<'a> Study<'a> {
     /// Checks that no run would replace a finished one of another study.
     fn check_folders(&self, sets: &[Set]) -> Result<(), Failure> {
         for (run, _) in sets.iter().flat_map(|set| &set.runs) {
-            let Some(other) = self.journal.other_run(&run.name(), &run.spec) else { continue };
+            let other = self.journal.other_run(&run.name(), &run.spec);
+            let folder = run.folder_in(self.output);
+            let Some(other) = other.filter(|_| folder.exists()) else { continue };
             let spec = run.spec.clone().into_table();
             let names: BTreeSet<&String> = spec.keys().chain(other.spec.keys()).collect();
             let differs =
                 |name: &&&String| spec.get(name.as_str()) != other.spec.get(name.as_str());
             let options = names.iter().filter(differs).map(|name| option_word(name));
             return Err(Failure::input(format!(
-                "{} has a finished run of {run} with other options ({}); choose another --output, \
-                 or move that folder away",
-                self.output.display(),
+                "{} has a finished run of another study, with other options ({}); choose another \
+                 --output, or move that folder away",
+                folder.display(),
                 options.collect::<Vec<_>>().join(", ")
             )));
         }

@@ -102,9 +102,14 @@ impl PlannedRun {
         format!("{}-{}-seed{}", self.label, self.folder, self.seed)
     }
 
+    /// The run's folder in that of the study.
+    pub(super) fn folder_in(&self, output: &Path) -> PathBuf {
+        output.join("runs").join(self.name())
+    }
+
     /// Trains and evaluates the run, and returns its outcome.
     pub(super) fn train(&self, output: &Path) -> Result<Outcome, Failure> {
-        let folder = output.join("runs").join(self.name());
+        let folder = self.folder_in(output);
         let begin = Instant::now();
         self.train_and_evaluate(&folder).map_err(|failure| {
             failure.and(&format!("this was the run {self}; the same command resumes here"))
@@ -116,7 +121,7 @@ impl PlannedRun {
     /// Reads the outcome of a run that is complete in its folder, but missing in the journal, which a full disk or a lost
     /// line can cause; `None` if the folder holds no such run.
     pub(super) fn finished(&self, output: &Path) -> Option<Outcome> {
-        let folder = output.join("runs").join(self.name());
+        let folder = self.folder_in(output);
         if self.needs_evaluation(&folder).ok()? {
             return None;
         }

@@ -74,6 +74,9 @@ fn seeds_are_added_until_each_scene_is_decided() {
     let stdout = until("--until-decided --seeds 2 --max-seeds 4").ok().stdout;
     let rule = stdout.find("rule     On each scene").expect("the rule");
     assert!(rule < stdout.find("[1/6]").expect("a first run"), "{stdout}");
+    for words in ["2 to begin with, at most 4; a further one", "undecided diet:split=random ("] {
+        assert!(stdout.contains(words), "{words} is not in {stdout}");
+    }
     let all = records(&output.join("compare.jsonl"));
     let seeds = |policy: &str| all.iter().filter(|run| run["factor"] == policy).count();
     // The first look needs three seeds, the last has four.
@@ -172,8 +175,7 @@ fn two_studies_in_one_folder_are_refused() {
     short(&format!("--seeds 1 {FLAGS}")).ok();
     let before = files(&output);
     // Another study would replace the runs.
-    short("--seeds 1 -- --sh-degree 1").refused("options", &["--sh-degree", "--output"]);
-    short(&format!("--seeds 2 -i 25 {FLAGS}").replace("-i 24", "")).refused("twice", &["-i"]);
+    short("--seeds 1 -- --sh-degree 1").refused("options", &["--sh-degree", "--output", "runs/"]);
     assert!(before == files(&output), "a refused study changed files");
     let lock = FolderLock::take(&output).expect("a lock");
     short(&format!("--seeds 2 {FLAGS}")).refused("at once", &["in use", "process"]);
@@ -181,6 +183,10 @@ fn two_studies_in_one_folder_are_refused() {
     assert!(before == files(&output), "a refused study changed files");
     short(&format!("--seeds 2 {FLAGS}")).ok();
     assert_eq!(records(&output.join("compare.jsonl")).len(), 4);
+    // Where the earlier runs were moved away, nothing can be lost.
+    std::fs::rename(output.join("runs"), output.join("earlier")).expect("an existing folder");
+    short("--seeds 1 -- --sh-degree 1").ok();
+    assert_eq!(records(&output.join("compare.jsonl")).len(), 6);
 }
 
 #[test]

@@ -139,7 +139,10 @@ fn row(case: &Case) -> [String; 5] {
 /// Adds the rule and the verdicts.
 pub(super) fn add(document: &mut Document, cases: &[Case], rule: &str) {
     document.section("Decisions");
-    document.paragraph(format!("The rule, fixed before the first run: {rule}."));
+    document.paragraph(format!(
+        "The rule, fixed before the first run: {rule}. The intervals of the other tables are those of a \
+         fixed number of seeds."
+    ));
     let mut table = Table::new(TITLES.map(Column::text));
     for case in cases {
         table.row(row(case).map(Text::from));

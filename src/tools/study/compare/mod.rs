@@ -23,7 +23,7 @@ use super::difference::{Difference, Pair};
 use super::outcome::Outcome;
 use super::planned_run::PlannedRun;
 use super::sequential::{Rule, SEEDS};
-use super::{EngineArgs, Finished, Limit, Study, distinct, labels, shared_options};
+use super::{EngineArgs, Finished, Limit, Study, about, distinct, labels, shared_options};
 pub use decisions::Decide;
 use densify_run::failure::Failure;
 use densify_run::{DEFAULT_BUDGET, Observer, Partial};
@@ -181,6 +181,17 @@ impl Comparison {
     ) -> Result<Option<Vec<Outcome>>, Failure> {
         let at_first = |run: &&PlannedRun| run.seed < self.seeds;
         let mut next: Vec<PlannedRun> = runs.iter().filter(at_first).cloned().collect();
+        if rule.is_some() && study.seconds_of(&next)? > 0.0 {
+            let further: Vec<PlannedRun> =
+                runs.iter().filter(|run| run.seed == self.seeds).cloned().collect();
+            let seconds = study.seconds_of(&further)?;
+            study.observer.say(format_args!(
+                "seeds    {} to begin with, at most {}; a further one of all comparisons takes {}",
+                self.seeds,
+                self.max_seeds,
+                about(seconds)
+            ));
+        }
         let mut outcomes = Vec::new();
         while !next.is_empty() {
             let Some(ran) = study.run(&next)? else { return Ok(None) };
