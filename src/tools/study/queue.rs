@@ -84,7 +84,9 @@ pub(super) fn names(sets: &[Set]) -> String {
     let titles = distinct(sets.iter().map(Set::title));
     let name = |title: &&str| {
         let seeds = sets.iter().filter(|set| set.title() == *title).map(Set::seed);
-        let seeds: Vec<String> = seeds.map(|seed| seed.to_string()).collect();
+        let mut seeds: Vec<u32> = seeds.collect();
+        seeds.sort_unstable();
+        let seeds: Vec<String> = seeds.iter().map(u32::to_string).collect();
         let word = if seeds.len() == 1 { "seed" } else { "seeds" };
         format!("{title} ({word} {})", seeds.join(", "))
     };
@@ -116,6 +118,7 @@ mod tests {
         };
         assert_eq!(order(&sets), [9.0, 1.0, 3.0, 2.0, 99.0]);
         assert_eq!(names(&sets), "room (seed 0); cup (seeds 0, 1)");
+        assert_eq!(names(&[sets[2].clone(), sets[1].clone()]), "cup (seeds 0, 1)");
         // Two at once: 9 and 1 + 3 + 2, then 99 after the 6.
         assert!((total_seconds(&sets, 2) - 105.0).abs() < 1e-9);
         assert!((total_seconds(&sets, 1) - 114.0).abs() < 1e-9);

@@ -84,7 +84,7 @@ pub struct Comparison {
     pub budget: Vec<SceneLimit>,
     /// Limits of the memory of each run, instead of budgets or in addition; a policy that needs less per
     /// Gaussian then has more of them. Spelled like --budget
-    #[arg(short, long, value_name = "BYTES", value_delimiter = ',', value_parser = SceneLimit::memory)]
+    #[arg(long, value_name = "BYTES", value_delimiter = ',', value_parser = SceneLimit::memory)]
     pub memory: Vec<SceneLimit>,
     /// Number of runs of each policy under each limit, with seeds 0, 1, …; with --until-decided, the
     /// number to begin with
