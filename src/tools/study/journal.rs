@@ -61,3 +61,39 @@ impl Journal {
         })
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::outcome::sample;
+
+    #[test]
+    fn outcomes_are_read_back_and_told_apart_by_their_descriptions() {
+        let root = tempfile::tempdir().unwrap();
+        let path = root.path().join("compare.jsonl");
+        let spec = |seed: i64| Partial::option("seed", seed);
+        let run = |seed: i64, psnr: f64| Outcome {
+            densify: env!("CARGO_PKG_VERSION").into(),
+            run: "room".into(),
+            spec: spec(seed).into_table(),
+            curve: vec![(1, psnr)],
+            ssim: 1.0,
+            flip: 0.0,
+            ..sample("diet", "1000", 0, psnr)
+        };
+        // A view that equals its photograph has an infinite PSNR.
+        let all = [run(0, 30.0), run(1, f64::INFINITY)];
+        let mut journal = Journal::open(&path).unwrap();
+        all.iter().for_each(|outcome| journal.add(outcome.clone()).unwrap());
+        let text = fs::read_to_string(&path).unwrap();
+        fs::write(&path, format!("{text}{{\"densify\":")).unwrap();
+        let journal = Journal::open(&path).unwrap();
+        assert!(journal.outcomes().eq(&all));
+        assert_eq!(journal.outcome(&spec(1)), Some(&all[1]));
+        assert_eq!(journal.outcome(&spec(2)), None);
+        // The folder holds the last run of its name.
+        assert_eq!(journal.other_run("room", &spec(0)), Some(&all[1]));
+        assert_eq!(journal.other_run("room", &spec(1)), None);
+        assert_eq!(journal.other_run("cup", &spec(0)), None);
+    }
+}

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use serde::{Deserialize, Serialize};
+use serde::{Deserialize, Deserializer, Serialize};
 use toml::Table;
 
 use super::limit::Limit;
@@ -39,6 +39,7 @@ pub(super) struct Outcome {
     #[serde(default)]
     pub(super) model_bytes: Option<u64>,
     /// Mean PSNR of the test views `[dB]`.
+    #[serde(deserialize_with = "or_infinite")]
     pub(super) psnr: f64,
     /// Mean SSIM of the test views.
     pub(super) ssim: f64,
@@ -71,10 +72,22 @@ pub(super) struct Outcome {
     /// Number of views rendered for the policy's decisions.
     pub(super) extra_forwards: u64,
     /// Iterations at which the test views were evaluated during training, with their mean PSNR `[dB]`.
+    #[serde(deserialize_with = "curve_or_infinite")]
     pub(super) curve: Vec<(u32, f64)>,
     /// Geometric errors, if the surface is known.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub(super) geometry: Option<Geometry>,
+}
+
+/// Reads a PSNR; where a view equals its photograph it is infinite, which JSON writes as null.
+fn or_infinite<'de, D: Deserializer<'de>>(from: D) -> Result<f64, D::Error> {
+    Ok(Option::deserialize(from)?.unwrap_or(f64::INFINITY))
+}
+
+/// Reads a curve of such values.
+fn curve_or_infinite<'de, D: Deserializer<'de>>(from: D) -> Result<Vec<(u32, f64)>, D::Error> {
+    let points = Vec::<(u32, Option<f64>)>::deserialize(from)?.into_iter();
+    Ok(points.map(|(step, psnr)| (step, psnr.unwrap_or(f64::INFINITY))).collect())
 }
 
 impl Outcome {
