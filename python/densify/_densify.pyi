@@ -41,6 +41,7 @@ __all__ = [
     "top_k",
     "compare",
     "compress",
+    "parse_bytes",
     "parse_rows",
     "parse_target",
     "plan",
@@ -278,6 +279,7 @@ def plan(
 def open_model(
     path: str, options: str, *, iteration: int | None, antialias: str | None, listener: Any
 ) -> OpenedModel: ...
+def parse_bytes(text: str) -> int: ...
 def parse_rows(text: str) -> int: ...
 def parse_target(text: str) -> tuple[int | None, int | None]: ...
 def compress(
@@ -301,9 +303,13 @@ def compare(
     scenes: Sequence[str],
     policies: Sequence[str],
     budgets: Sequence[tuple[str | None, int]],
+    memory: Sequence[tuple[str | None, int]],
     options: str,
     *,
     seeds: int,
+    until_decided: str | None,
+    max_seeds: int,
+    hours: float | None,
     iterations: int,
     output: str,
     listener: Any,

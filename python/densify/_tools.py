@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from os import fspath
 from pathlib import Path
@@ -15,6 +15,9 @@ from ._run import read_records
 from ._scenes import StrPath, plain
 from ._settings import PolicyLike, RunOrModel, Scene, table_of
 from ._signals import noting
+
+# A limit for all scenes, several, or one per scene.
+Limits = int | str | Sequence[int | str] | Mapping[str, int | str]
 
 
 @dataclass(frozen=True)
@@ -111,14 +114,22 @@ def compare(
     scenes: Scene | Sequence[Scene],
     policies: Sequence[PolicyLike],
     *,
-    budget: int | str | Sequence[int | str] | Mapping[str, int | str],
+    budget: Limits = (),
+    memory: Limits = (),
     seeds: int = 3,
+    until_decided: str | None = None,
+    max_seeds: int = 12,
+    hours: float | None = None,
     iterations: int = 7000,
     output: StrPath = "comparison",
     progress: bool = True,
     **options: Any,
 ) -> Comparison:
     """Trains a scene with several policies under the same conditions, and says which did best.
+
+    Runs are limited to a budget of Gaussians, or to a memory; ``{"room": "28k"}`` is for single scenes. With
+    ``until_decided="scenes"`` or ``"mean"``, seeds are added, up to ``max_seeds``, until a sequential test decides.
+    ``hours`` starts only what is expected to end within them; call again for the rest.
 
     Each run is a process of its own, so classes must be in a file; write one with ``%%writefile`` in a notebook. An
     interrupted comparison continues when it is called again.
@@ -141,19 +152,18 @@ def compare(
         table["policy_file"] = files
     single = isinstance(scenes, str) or hasattr(scenes, "__fspath__")
     all_scenes = cast("Sequence[Scene]", [scenes] if single else scenes)
-    budgets: list[tuple[str | None, int]]
-    if isinstance(budget, Mapping):
-        budgets = [(scene, _rows_of(rows)) for scene, rows in budget.items()]
-    else:
-        budgets = [(None, _rows_of(rows)) for rows in ([budget] if isinstance(budget, (int, str)) else budget)]
     stop = _densify.Stop()
     with noting(stop):
         summary, report = _densify.compare(
             [fspath(scene) for scene in all_scenes],
             names,
-            budgets,
+            _limits_of(budget, _densify.parse_rows),
+            _limits_of(memory, _densify.parse_bytes),
             plain(table),
             seeds=seeds,
+            until_decided=until_decided,
+            max_seeds=max_seeds,
+            hours=hours,
             iterations=iterations,
             output=fspath(output),
             listener=Listener(progress),
@@ -163,8 +173,14 @@ def compare(
     return Comparison(summary, path, path.with_suffix(".html"), read_records(path.with_suffix(".jsonl")))
 
 
-def _rows_of(budget: int | str) -> int:
-    return _densify.parse_rows(budget) if isinstance(budget, str) else budget
+def _limits_of(given: Limits, parse: Callable[[str], int]) -> list[tuple[str | None, int]]:
+    if isinstance(given, Mapping):
+        return [(scene, _number_of(limit, parse)) for scene, limit in given.items()]
+    return [(None, _number_of(limit, parse)) for limit in ([given] if isinstance(given, (int, str)) else given)]
+
+
+def _number_of(limit: int | str, parse: Callable[[str], int]) -> int:
+    return parse(limit) if isinstance(limit, str) else limit
 
 
 class Page:

@@ -104,7 +104,9 @@ mod _densify {
         policies, quantile, register, signals, smallest, spare_one, top_k,
     };
     #[pymodule_export]
-    use super::tools::{compare, compress, parse_rows, parse_target, plan, report, scenegen};
+    use super::tools::{
+        compare, compress, parse_bytes, parse_rows, parse_target, plan, report, scenegen,
+    };
     #[pymodule_export]
     use super::training::{TrainerCore, prepare, train};
     #[pymodule_export]

@@ -12,7 +12,7 @@ use densify_run::failure::Failure;
 use densify_run::finished::{is_model, model_file};
 use densify_run::refining::TrainedModel;
 use densify_scenegen::{self as generator, Scene, Source};
-use densify_study::{Comparison, SceneBudget};
+use densify_study::{Comparison, Decide, EngineArgs, Limit, SceneLimit};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 
@@ -170,22 +170,41 @@ fn overlay(
     Ok(defaults)
 }
 
+/// Parses a number of bytes: "512MiB".
+#[pyfunction]
+pub(crate) fn parse_bytes(text: &str) -> PyResult<u64> {
+    numbers::bytes(text).map_err(PyValueError::new_err)
+}
+
 /// Compares policies; returns the summary and the file of the report.
 #[pyfunction]
-#[pyo3(signature = (scenes, policies, budgets, options, *, seeds, iterations, output, listener, stop))]
+#[pyo3(signature = (scenes, policies, budgets, memory, options, *, seeds, until_decided, max_seeds, hours, iterations, output, listener, stop))]
 #[expect(clippy::too_many_arguments, reason = "keyword arguments")]
 pub(crate) fn compare(
     py: Python<'_>,
     scenes: Vec<PathBuf>,
     policies: Vec<String>,
     budgets: Vec<(Option<String>, usize)>,
+    memory: Vec<(Option<String>, u64)>,
     options: &str,
     seeds: u32,
+    until_decided: Option<&str>,
+    max_seeds: u32,
+    hours: Option<f64>,
     iterations: u32,
     output: PathBuf,
     listener: &Bound<'_, PyAny>,
     stop: &Bound<'_, Stop>,
 ) -> PyResult<(String, PathBuf)> {
+    let until_decided = match until_decided {
+        Some("scenes") => Some(Decide::Scenes),
+        Some("mean") => Some(Decide::Mean),
+        Some(other) => {
+            let message = format!("until_decided: `{other}` is neither \"scenes\" nor \"mean\"");
+            return Err(PyValueError::new_err(message));
+        }
+        None => None,
+    };
     Listener::new(Some(listener), Some(stop))?.follow(py, move |follower| {
         let within = |range: std::ops::RangeInclusive<u32>, name: &str, value: u32| {
             if range.contains(&value) {
@@ -198,20 +217,28 @@ pub(crate) fn compare(
             )))
         };
         within(1..=1000, "seeds", seeds)?;
+        within(3..=12, "max_seeds", max_seeds)?;
         within(1..=u32::MAX, "iterations", iterations)?;
-        if scenes.is_empty() || policies.is_empty() || budgets.is_empty() {
-            return Err(Failure::input("name at least one scene, one policy and one budget"));
+        let has_limit = !budgets.is_empty() || !memory.is_empty();
+        if scenes.is_empty() || policies.is_empty() || !has_limit {
+            return Err(Failure::input(
+                "name at least one scene, one policy, and one budget or memory",
+            ));
         }
-        let budget = budgets.into_iter().map(|(scene, rows)| SceneBudget { scene, rows }).collect();
+        let rows = |(scene, rows)| SceneLimit { scene, limit: Limit::Rows(rows) };
+        let bytes = |(scene, bytes)| SceneLimit { scene, limit: Limit::Memory(bytes) };
         let comparison = Comparison {
             scenes,
             policies,
-            budget,
+            budget: budgets.into_iter().map(rows).collect(),
+            memory: memory.into_iter().map(bytes).collect(),
             seeds,
+            until_decided,
+            max_seeds,
             iterations,
             output,
             train: Vec::new(),
-            engine: densify_study::EngineArgs::default(),
+            engine: EngineArgs { hours, ..EngineArgs::default() },
         };
         let finished = comparison.run(options::partial(options)?, follower)?;
         let finished = finished.ok_or_else(|| Failure::input("the comparison is not finished"))?;

@@ -439,6 +439,24 @@ def test_a_policy_by_name_brings_its_file(scene: Path, tmp_path: Path) -> None:
         densify.compare(scene, ["named"], budget="much", output=tmp_path / "other")
 
 
+def test_a_comparison_takes_memory_hours_and_a_rule(scene: Path, tmp_path: Path) -> None:
+    def compare(**options: Any) -> densify.Comparison:
+        output, short = tmp_path / "limits", {"iterations": 20, "progress": False, "threads": 2, "backend": "cpu"}
+        return densify.compare(scene, ["vanilla", "diet"], output=output, **short, **options)
+
+    compared = compare(memory={scene.name: "120MiB"}, seeds=1, hours=24)
+    assert [run["memory"] for run in compared.runs] == [120 << 20] * 2
+    decided = compare(budget=220, until_decided="mean", max_seeds=3)
+    assert "mean over the scenes" in decided.summary
+    with pytest.raises(ValueError, match="neither"):
+        compare(budget=220, until_decided="all")
+    with pytest.raises(ValueError, match="512MiB"):
+        compare(memory="much")
+    for wrong in [{"budget": 220, "hours": 0}, {"budget": 220, "max_seeds": 13}, {}]:
+        with pytest.raises(densify.InputError):
+            compare(**wrong)
+
+
 def test_helpers_sort_as_in_rust() -> None:
     values = np.array([1.0, np.nan, 3.0, 3.0, -np.inf], dtype=np.float64)
     assert densify.top_k(values, 3).tolist() == [2, 3, 0]

@@ -1,4 +1,4 @@
-//! The memory of runs that are only planned here and trained later, such as those of a batch.
+//! The memory and the extent of runs that are only planned here and trained later, such as those of a batch.
 
 use super::{ModelSize, ResolvedRun};
 use crate::failure::Failure;
@@ -20,11 +20,40 @@ pub fn estimate(
     Ok((run.size.rows, run.case.ledger_of(&run.size)?))
 }
 
-/// Upper bound of the host memory of a run `[bytes]`.
+/// How much a run is going to hold and to process.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Extent {
+    /// Upper bound of its host memory `[bytes]`.
+    pub host_bytes: u64,
+    /// Maximum number of rows.
+    pub rows: usize,
+    /// Mean number of pixels of a training view.
+    pub pixels: f64,
+    /// Number of views held out.
+    pub test_views: usize,
+    /// Number of processor threads.
+    pub threads: usize,
+    /// True if a GPU trains.
+    pub is_on_gpu: bool,
+}
+
+/// The extent of a run.
 ///
 /// # Errors
 /// The errors of preparing the run.
-pub fn host_bytes(spec: &RunSpec, host: Host<'_>) -> Result<u64, Failure> {
-    let run = ResolvedRun::for_new_run(spec, host)?;
-    Ok(run.case.ledger_of(&run.size)?.on_host())
+pub fn extent(spec: &RunSpec, host: Host<'_>) -> Result<Extent, Failure> {
+    let ResolvedRun { case, size, .. } = ResolvedRun::for_new_run(spec, host)?;
+    let dataset = &case.inputs.dataset;
+    let areas = dataset.train.iter().map(|view| {
+        let camera = &view.camera;
+        f64::from(camera.width) * f64::from(camera.height)
+    });
+    Ok(Extent {
+        host_bytes: case.ledger_of(&size)?.on_host(),
+        rows: size.rows,
+        pixels: areas.sum::<f64>() / dataset.train.len().max(1) as f64,
+        test_views: dataset.test.len(),
+        threads: case.choices.threads,
+        is_on_gpu: case.inputs.device.adapter().is_some(),
+    })
 }

@@ -29,7 +29,7 @@ pub use config::{
     DegreeSource, ExposureSource, Findings, ModelSize, PoseSource, RunConfig, VignetteSource,
 };
 pub(crate) use coordinates::random_points;
-pub use estimate::{estimate, host_bytes};
+pub use estimate::{Extent, estimate, extent};
 pub(crate) use fit::RunSize;
 pub(crate) use geometry_measurement::GeometryMeasurement;
 pub(crate) use models::{importance_setup, read};

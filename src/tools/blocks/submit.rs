@@ -39,6 +39,7 @@ pub fn submit(
         stages: stages.into_iter().filter(|stage| !stage.jobs.is_empty()).collect(),
         inputs: Vec::new(),
         status: "`densify blocks status`".to_owned(),
+        deadline: None,
         folder,
     };
     launch::submit(&batch, submission, observer)
@@ -51,5 +52,6 @@ fn job(plan: &BlockPlan, task: Task) -> Job {
         memory: plan.memory(task),
         threads: if task == Task::Merge { 1 } else { plan.threads },
         may_have_fewer_threads: true,
+        expected: None,
     }
 }

@@ -9,6 +9,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::sync::OnceLock;
+use std::time::{Duration, Instant};
 
 use clap::Args;
 use serde::{Deserialize, Serialize};
@@ -17,6 +18,7 @@ use densify_core::files;
 use densify_core::files::{FileError, write_atomically};
 use densify_run::Observer;
 use densify_run::failure::{Failure, OTHER};
+pub use local::slots;
 
 /// The system that starts tasks.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
@@ -101,6 +103,8 @@ pub struct Batch {
     pub inputs: Vec<(PathBuf, String)>,
     /// How the user can see the progress, for messages.
     pub status: String,
+    /// On this machine, tasks that would end later are not started.
+    pub deadline: Option<Instant>,
 }
 
 /// Independent tasks.
@@ -127,6 +131,8 @@ pub struct Job {
     pub threads: u32,
     /// True if the task accepts a smaller number of threads through `--threads`.
     pub may_have_fewer_threads: bool,
+    /// Expected time, if it is known.
+    pub expected: Option<Duration>,
 }
 
 impl Batch {

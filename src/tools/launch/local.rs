@@ -4,7 +4,7 @@ use std::fs::{self, File, TryLockError};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::thread::sleep;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use super::{Batch, Job, Stage};
 use densify_core::files::FileError;
@@ -29,6 +29,11 @@ fn concurrency(jobs: &[Job]) -> (usize, u32) {
     let count = most.max(1);
     let share = cores / u32::try_from(count).unwrap_or(u32::MAX);
     (count, if is_fixed { threads } else { share.min(threads).max(1) })
+}
+
+/// Number of these tasks that this machine runs at once.
+pub fn slots(jobs: &[Job]) -> usize {
+    concurrency(jobs).0
 }
 
 /// Prints the commands without running them.
@@ -80,7 +85,7 @@ fn run_stage(
                     let code = status.code().and_then(|code| u8::try_from(code).ok());
                     let message = format!(
                         "{name} has failed: {}; run the same command again to resume ({})",
-                        last_line(&log),
+                        last_message(&log),
                         log.display()
                     );
                     failed.get_or_insert(Failure::new(code.unwrap_or(OTHER), message));
@@ -97,6 +102,10 @@ fn run_stage(
         }
         while failed.is_none() && running.len() < count {
             let Some(next) = waiting.next() else { break };
+            if !fits(next, batch.deadline) {
+                observer.say(format_args!("left out {}: it would end too late", next.name));
+                continue;
+            }
             observer.say(format_args!("started  {}", next.name));
             running.push((&next.name, start(batch, next, threads, logs)?));
         }
@@ -105,6 +114,12 @@ fn run_stage(
         }
         sleep(POLL_INTERVAL);
     }
+}
+
+/// True if a task that starts now is expected to end before the deadline.
+fn fits(job: &Job, deadline: Option<Instant>) -> bool {
+    let end = Instant::now() + job.expected.unwrap_or_default();
+    deadline.is_none_or(|deadline| end <= deadline)
 }
 
 fn log_path(logs: &Path, name: &str) -> PathBuf {
@@ -143,9 +158,53 @@ fn lock(batch: &Batch) -> Result<File, Failure> {
     }
 }
 
-/// The last line of a task's output.
-fn last_line(log: &Path) -> String {
+/// The message of the error that ended a task, or else the last line of its output.
+fn last_message(log: &Path) -> String {
     let text = fs::read_to_string(log).unwrap_or_default();
-    let line = text.lines().rev().find(|line| !line.trim().is_empty()).unwrap_or("no output");
-    line.trim().trim_start_matches("error: ").to_owned()
+    // The log continues that of an earlier attempt.
+    let message = text.rsplit_once("error: ").map(|(_, message)| message);
+    let lines = message.unwrap_or(&text).lines().map(str::trim).filter(|line| !line.is_empty());
+    let lines: Vec<&str> = lines.collect();
+    match (message, lines.last()) {
+        (_, None) => "no output".to_owned(),
+        (Some(_), _) => lines.join(" "),
+        (None, Some(last)) => (*last).to_owned(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_task_fits_if_it_ends_before_the_deadline() {
+        let minutes = |minutes: u64| Duration::from_secs(60 * minutes);
+        let deadline = Some(Instant::now() + minutes(10));
+        let job = |expected| Job {
+            name: String::new(),
+            index: 0,
+            memory: 1,
+            threads: 1,
+            may_have_fewer_threads: false,
+            expected,
+        };
+        assert!(fits(&job(Some(minutes(8))), deadline));
+        assert!(!fits(&job(Some(minutes(12))), deadline));
+        assert!(fits(&job(Some(minutes(12))), None) && fits(&job(None), deadline));
+        assert!(!fits(&job(None), Some(Instant::now() - minutes(1))));
+    }
+
+    #[test]
+    fn the_message_of_the_last_error_is_shown_as_a_whole() {
+        let log = std::env::temp_dir().join(format!("densify-launch-{}.log", std::process::id()));
+        for (text, expected) in [
+            ("", "no output"),
+            ("one\ntwo\n\n", "two"),
+            ("error: old\nrunning\nerror: bad\nthis was a\n", "bad this was a"),
+        ] {
+            fs::write(&log, text).unwrap();
+            assert_eq!(last_message(&log), expected);
+        }
+        fs::remove_file(&log).unwrap();
+    }
 }

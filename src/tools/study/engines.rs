@@ -1,13 +1,18 @@
 //! Submits the runs of a study to an engine: several at once on this machine, or on a cluster with a shared folder.
 
 use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
 
 use clap::Args;
 
 use super::planned_run::PlannedRun;
+use super::queue::{Set, Timed};
 use densify_launch::{self as launch, Batch, Engine, Job, Stage, Submission, SubmissionArgs, utf8};
+use densify_run::Observer;
 use densify_run::failure::Failure;
-use densify_run::{Host, Observer, Partial, RunSpec, host_bytes};
+
+/// Largest number of hours of a study: a year.
+const MOST_HOURS: f64 = 8766.0;
 
 /// The engine that trains the runs of a study.
 #[derive(Debug, Clone, Default, Args)]
@@ -17,9 +22,20 @@ pub struct EngineArgs {
     /// trained one after another. Run the same command again to collect the results of a scheduler. Times are then
     /// comparable only if the machines are alike and run nothing else
     #[arg(long, value_name = "ENGINE")]
-    engine: Option<Engine>,
+    pub engine: Option<Engine>,
+    /// Start only what is expected to end within this time, and say before which runs these are; the same command
+    /// continues with the rest. Runs that are compared with each other are started together or not at all
+    #[arg(long, value_name = "H", value_parser = hours)]
+    pub hours: Option<f64>,
+    /// Options of the submission.
     #[command(flatten)]
-    options: SubmissionArgs,
+    pub options: SubmissionArgs,
+}
+
+/// Reads a number of hours.
+fn hours(text: &str) -> Result<f64, String> {
+    let hours = text.parse().ok().filter(|hours| *hours > 0.0 && *hours <= MOST_HOURS);
+    hours.ok_or_else(|| format!("`{text}` is not a number of hours; write it as 8 or 0.5"))
 }
 
 impl EngineArgs {
@@ -28,6 +44,25 @@ impl EngineArgs {
             Some(engine) => self.options.for_engine(engine).map(Some),
             None => self.options.require_none().map(|()| None),
         }
+    }
+
+    /// The time of `--hours`.
+    pub(super) fn time(&self) -> Result<Option<Duration>, Failure> {
+        let Some(hours) = self.hours else { return Ok(None) };
+        self.require_here("--hours")?;
+        // From Python, the number has not been parsed.
+        self::hours(&hours.to_string()).map_err(Failure::input)?;
+        Ok(Some(Duration::from_secs_f64(3600.0 * hours)))
+    }
+
+    /// Checks that runs are trained on this machine, for options that need it.
+    pub(super) fn require_here(&self, flag: &str) -> Result<(), Failure> {
+        if self.engine.is_none_or(|engine| engine == Engine::Local) {
+            return Ok(());
+        }
+        Err(Failure::input(format!(
+            "{flag} is for runs on this machine; leave it out, or use --engine local"
+        )))
     }
 }
 
@@ -52,17 +87,42 @@ impl StudyRun {
     }
 }
 
-/// Starts or submits the runs that are not done. If they were already submitted, reports the jobs instead.
+/// The runs as tasks of an engine. `all` are the study's runs, whose numbers a scheduler shows.
+pub(super) fn jobs(sets: &[Set], all: &[PlannedRun]) -> Result<Vec<(Job, PlannedRun)>, Failure> {
+    let job = |(run, seconds): &Timed| {
+        let spec = run.spec.clone().describe()?;
+        let all_threads = || rayon::current_num_threads().try_into().unwrap_or(1);
+        let job = Job {
+            name: run.name(),
+            index: all.iter().position(|other| other.spec == run.spec).unwrap_or(0),
+            memory: run.promised_bytes.unwrap_or(0),
+            threads: spec.device.threads.map_or_else(all_threads, |threads| threads.0),
+            may_have_fewer_threads: false,
+            expected: Duration::try_from_secs_f64(*seconds).ok(),
+        };
+        Ok((job, run.clone()))
+    };
+    sets.iter().flat_map(|set| &set.runs).map(job).collect()
+}
+
+/// Number of these runs that this machine trains at once.
+pub(super) fn at_once(sets: &[Set]) -> Result<usize, Failure> {
+    let jobs: Vec<Job> = jobs(sets, &[])?.into_iter().map(|(job, _)| job).collect();
+    Ok(launch::slots(&jobs))
+}
+
+/// Starts or submits the runs. If they were already submitted, reports the jobs instead. `done` and `count` are numbers
+/// of runs of the study.
 pub(super) fn submit(
     output: &Path,
-    runs: &[PlannedRun],
-    is_done: impl Fn(&PlannedRun) -> bool,
+    mut jobs: Vec<(Job, PlannedRun)>,
+    [done, count]: [usize; 2],
+    deadline: Option<Instant>,
     submission: Submission,
     observer: &dyn Observer,
 ) -> Result<(), Failure> {
     let folder = std::path::absolute(output).map_err(Failure::input)?;
-    let done = runs.iter().filter(|run| is_done(run)).count();
-    observer.say(format_args!("runs     {done} of {} done", runs.len()));
+    observer.say(format_args!("runs     {done} of {count} done"));
     let is_scheduled = !matches!(submission.engine, Engine::Local) && !submission.dry_run;
     if is_scheduled
         && !submission.again
@@ -75,53 +135,23 @@ pub(super) fn submit(
         ));
         return Ok(());
     }
-    let mut known_memory: Vec<(Partial, u64)> = Vec::new();
-    let mut jobs: Vec<Job> = Vec::new();
-    let mut submitted: Vec<&Partial> = Vec::new();
-    let mut inputs = Vec::new();
-    for (index, run) in runs.iter().enumerate() {
-        // Runs with the same description are trained once.
-        if is_done(run) || submitted.contains(&&run.spec) {
-            continue;
-        }
-        submitted.push(&run.spec);
-        inputs.push(run.task_file(&folder)?);
-        let spec = run.spec.clone().describe()?;
-        let all_threads = || rayon::current_num_threads().try_into().unwrap_or(1);
-        jobs.push(Job {
-            name: run.name(),
-            index,
-            memory: promised_bytes(run, &spec, &mut known_memory)?,
-            threads: spec.device.threads.map_or_else(all_threads, |threads| threads.0),
-            may_have_fewer_threads: false,
-        });
+    if submission.engine != Engine::Local {
+        // Schedulers start the tasks of an array in the order of their numbers.
+        jobs.sort_by_key(|(job, _)| job.index);
     }
+    let inputs = jobs.iter().map(|(_, run)| run.task_file(&folder)).collect::<Result<_, _>>()?;
+    let jobs = jobs.into_iter().map(|(job, _)| job).collect();
     let batch = Batch {
         command: ["study-run", utf8(&folder)?].map(str::to_owned).into(),
         stages: vec![Stage { name: "runs", is_array: true, jobs }],
         inputs,
         status: "the output of that process".to_owned(),
         folder,
+        deadline,
     };
     launch::submit(&batch, submission, observer)?;
     if is_scheduled {
         observer.say(format_args!("run the same command again to collect the results"));
     }
     Ok(())
-}
-
-/// Upper bound of a run's memory `[bytes]`. It does not depend on the seed, so it is computed once for all seeds.
-fn promised_bytes(
-    run: &PlannedRun,
-    spec: &RunSpec,
-    known: &mut Vec<(Partial, u64)>,
-) -> Result<u64, Failure> {
-    let mut options = run.spec.clone();
-    options.remove("seed");
-    if let Some((_, bytes)) = known.iter().find(|(other, _)| *other == options) {
-        return Ok(*bytes);
-    }
-    let bytes = host_bytes(spec, Host::default())?;
-    known.push((options, bytes));
-    Ok(bytes)
 }

@@ -37,6 +37,18 @@ impl Journal {
         self.outcomes.iter().rev().find(|run| run.is_of(spec))
     }
 
+    /// All outcomes, in the order in which the runs ended.
+    pub(super) fn outcomes(&self) -> impl Iterator<Item = &Outcome> + Clone {
+        self.outcomes.iter()
+    }
+
+    /// A finished run of this version of densify that has this name, but another description.
+    pub(super) fn other_run(&self, name: &str, spec: &Partial) -> Option<&Outcome> {
+        let is_current = |run: &&Outcome| run.densify == env!("CARGO_PKG_VERSION");
+        let last = self.outcomes.iter().rev().filter(is_current).find(|run| run.run == name);
+        last.filter(|run| !run.is_of(spec))
+    }
+
     /// Adds an outcome and writes the file.
     pub(super) fn add(&mut self, outcome: Outcome) -> Result<(), FileError> {
         self.outcomes.push(outcome);
@@ -47,5 +59,41 @@ impl Journal {
             }
             Ok(())
         })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::outcome::sample;
+
+    #[test]
+    fn outcomes_are_read_back_and_told_apart_by_their_descriptions() {
+        let root = tempfile::tempdir().unwrap();
+        let path = root.path().join("compare.jsonl");
+        let spec = |seed: i64| Partial::option("seed", seed);
+        let run = |seed: i64, psnr: f64| Outcome {
+            densify: env!("CARGO_PKG_VERSION").into(),
+            run: "room".into(),
+            spec: spec(seed).into_table(),
+            curve: vec![(1, psnr)],
+            ssim: 1.0,
+            flip: 0.0,
+            ..sample("diet", "1000", 0, psnr)
+        };
+        // A view that equals its photograph has an infinite PSNR.
+        let all = [run(0, 30.0), run(1, f64::INFINITY)];
+        let mut journal = Journal::open(&path).unwrap();
+        all.iter().for_each(|outcome| journal.add(outcome.clone()).unwrap());
+        let text = fs::read_to_string(&path).unwrap();
+        fs::write(&path, format!("{text}{{\"densify\":")).unwrap();
+        let journal = Journal::open(&path).unwrap();
+        assert!(journal.outcomes().eq(&all));
+        assert_eq!(journal.outcome(&spec(1)), Some(&all[1]));
+        assert_eq!(journal.outcome(&spec(2)), None);
+        // The folder holds the last run of its name.
+        assert_eq!(journal.other_run("room", &spec(0)), Some(&all[1]));
+        assert_eq!(journal.other_run("room", &spec(1)), None);
+        assert_eq!(journal.other_run("cup", &spec(0)), None);
     }
 }

@@ -3,17 +3,21 @@
 use std::fmt;
 use std::fs;
 use std::path::{Path, PathBuf};
+use std::time::Instant;
 
 use serde::{Deserialize, Serialize};
 use toml::Value;
 
+use super::limit::Limit;
 use super::outcome::Outcome;
 use super::process;
 use densify_core::files::{self, write_atomically};
 use densify_data::dataset::{GroundTruth, builtin};
 use densify_run::Partial;
 use densify_run::failure::{Failure, OTHER};
-use densify_train::output::{geometry_of, model_path, scores_of, summary_of};
+use densify_train::output::{
+    CONFIG_FILE, geometry_of, model_path, scores_by_view, scores_of, summary_of,
+};
 
 /// A run of a study. Engines receive it as a file.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
@@ -25,9 +29,21 @@ pub(super) struct PlannedRun {
     /// The factor that is varied, and its level.
     pub(super) factor: String,
     pub(super) level: String,
+    /// The runs that this one is compared with, without the seed: the set is started together or not at all.
+    pub(super) set: String,
+    /// Maximum number of rows; 0 if memory is the limit.
     pub(super) budget: usize,
+    /// Memory limit, if that is what is equal for all policies `[bytes]`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(super) memory: Option<u64>,
     pub(super) seed: u32,
     pub(super) iterations: u32,
+    /// Upper bound of its host memory `[bytes]`, if the scene was opened.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(super) promised_bytes: Option<u64>,
+    /// Its time by constants, if the scene was opened `[s]`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(super) modelled_seconds: Option<f64>,
     /// Factor and level for the user, such as `vanilla, 9 rows`.
     pub(super) title: String,
     /// Factor and level for the name of the folder.
@@ -50,26 +66,35 @@ impl PlannedRun {
     pub(super) fn new(
         shared: &Partial,
         (scene, label): (&Path, &str),
-        budget: usize,
+        limit: Limit,
         seed: u32,
         iterations: u32,
     ) -> Self {
         let options = [
             ("scene", Value::from(scene.to_string_lossy().into_owned())),
-            ("budget", Value::from(i64::try_from(budget).unwrap_or(i64::MAX))),
             ("seed", Value::from(seed)),
             ("iterations", Value::from(iterations)),
         ];
         let add = |spec, (name, value)| Partial::option(name, value).over(spec);
+        let (budget, memory) = match limit {
+            Limit::Rows(rows) => (rows, None),
+            Limit::Memory(bytes) => (0, Some(bytes)),
+        };
         Self {
             scene: scene.to_owned(),
             label: label.to_owned(),
             budget,
+            memory,
             seed,
             iterations,
-            spec: options.into_iter().fold(shared.clone(), add),
+            spec: limit.option().over(options.into_iter().fold(shared.clone(), add)),
             ..Self::default()
         }
+    }
+
+    /// The limit under which the run is compared.
+    pub(super) fn limit(&self) -> Limit {
+        self.memory.map_or(Limit::Rows(self.budget), Limit::Memory)
     }
 
     /// Name of the run's folder.
@@ -77,24 +102,49 @@ impl PlannedRun {
         format!("{}-{}-seed{}", self.label, self.folder, self.seed)
     }
 
+    /// The run's folder in that of the study.
+    pub(super) fn folder_in(&self, output: &Path) -> PathBuf {
+        output.join("runs").join(self.name())
+    }
+
     /// Trains and evaluates the run, and returns its outcome.
     pub(super) fn train(&self, output: &Path) -> Result<Outcome, Failure> {
-        let folder = output.join("runs").join(self.name());
+        let folder = self.folder_in(output);
+        let begin = Instant::now();
         self.train_and_evaluate(&folder).map_err(|failure| {
             failure.and(&format!("this was the run {self}; the same command resumes here"))
         })?;
-        self.outcome(&folder)
+        let wall_seconds = Some(begin.elapsed().as_secs_f64());
+        Ok(Outcome { wall_seconds, ..self.outcome(&folder)? })
+    }
+
+    /// Reads the outcome of a run that is complete in its folder, but missing in the journal, which a full disk or a lost
+    /// line can cause; `None` if the folder holds no such run.
+    pub(super) fn finished(&self, output: &Path) -> Option<Outcome> {
+        let folder = self.folder_in(output);
+        if self.needs_evaluation(&folder).ok()? {
+            return None;
+        }
+        let summary = summary_of(&folder).ok()??;
+        let config = Partial::read(&folder.join(CONFIG_FILE)).ok()?;
+        let is_this = summary.finished && self.spec.clone().over(config.clone()) == config;
+        let outcome = if is_this { self.outcome(&folder).ok()? } else { return None };
+        outcome.is_of(&self.spec).then_some(outcome)
     }
 
     fn train_and_evaluate(&self, folder: &Path) -> Result<(), Failure> {
         process::train(&self.spec, folder)?;
-        let has_surface = builtin::name(&self.scene).is_some() || GroundTruth::is_in(&self.scene);
-        if self.scores_without_shortcuts
-            || has_surface && geometry_of(folder, self.iterations)?.is_none()
-        {
+        if self.needs_evaluation(folder)? {
             process::evaluate(&self.spec, folder)?;
         }
         Ok(())
+    }
+
+    /// True if training has not measured everything that the study needs.
+    fn needs_evaluation(&self, folder: &Path) -> Result<bool, Failure> {
+        let has_surface = builtin::name(&self.scene).is_some() || GroundTruth::is_in(&self.scene);
+        Ok(self.scores_without_shortcuts
+            || has_surface && geometry_of(folder, self.iterations)?.is_none())
     }
 
     /// The file that describes the run to an engine, and its text.
@@ -154,20 +204,26 @@ impl PlannedRun {
             scene: self.label.clone(),
             factor: self.factor.clone(),
             level: self.level.clone(),
-            budget: self.budget,
+            budget: if self.memory.is_some() { summary.budget } else { self.budget },
+            memory: self.memory,
             seed: self.seed,
             iterations,
             run: self.name(),
             spec: self.spec.clone().into_table(),
             model: crc32c::crc32c(&model),
+            model_bytes: Some(model.len() as u64),
             psnr: scores.psnr,
             ssim: scores.ssim,
             flip: scores.flip,
+            lpips: scores.lpips,
+            views: scores_by_view(folder, iterations)?,
             rows: summary.rows,
             peak_rows: summary.peak_rows,
             peak_bytes: summary.peak_bytes,
             ledger_bytes: summary.ledger_bytes,
             seconds: summary.seconds,
+            wall_seconds: None,
+            modelled_seconds: self.modelled_seconds,
             cpu_seconds: summary.cpu_seconds,
             extra_forwards: summary.extra_forwards,
             curve: summary.test.iter().map(|(step, mean)| (*step, mean.psnr)).collect(),

@@ -17,7 +17,7 @@ const TRIES: usize = 10;
 ///
 /// Folders are locked only on Unix, whose locks do not prevent reading the file, and only on file systems with locks.
 #[derive(Debug)]
-pub(super) struct FolderLock {
+pub struct FolderLock {
     path: PathBuf,
     file: Option<File>,
 }
@@ -27,7 +27,7 @@ impl FolderLock {
     ///
     /// # Errors
     /// [`FolderError::InUse`] while another process has the lock; [`FolderError::File`].
-    pub(super) fn take(folder: &Path) -> Result<Self, FolderError> {
+    pub fn take(folder: &Path) -> Result<Self, FolderError> {
         let path = folder.join(LOCK);
         if !cfg!(unix) {
             return Ok(Self { path, file: None });

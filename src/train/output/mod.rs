@@ -28,8 +28,10 @@ mod tensorboard;
 pub use cameras::cameras_json;
 pub use error::FolderError;
 pub use folder::{CHECKPOINTS, Guard, RunFolder, is_in_use, model_path, saved_iterations};
+pub use lock::FolderLock;
 pub use reading::{
-    all_scores, events_of, geometry_of, psnr_by_view, read_json, scores_of, steps_of, summary_of,
+    all_scores, events_of, geometry_of, psnr_by_view, read_json, scores_by_view, scores_of,
+    steps_of, summary_of,
 };
 pub use records::{RecordLog, StepRecord, Summary, write_geometry, write_json, write_scores};
 pub use tensorboard::TensorBoard;

@@ -53,6 +53,24 @@ pub fn psnr_by_view(run: &Path, iteration: u32) -> Result<BTreeMap<String, f64>,
     Ok(psnr.into_iter().map(|(name, psnr)| (name, psnr.unwrap_or(f64::INFINITY))).collect())
 }
 
+/// The scores of each test view at an iteration, by view name; empty if the model was not evaluated then.
+pub fn scores_by_view(run: &Path, iteration: u32) -> Result<BTreeMap<String, Mean>, FileError> {
+    let path = run.join("per_view.json");
+    let columns: Option<BTreeMap<String, Map<String, Value>>> = entry_of(&path, iteration)?;
+    let mut views: BTreeMap<String, Map<String, Value>> = BTreeMap::new();
+    for (score, column) in columns.unwrap_or_default() {
+        for (view, value) in column {
+            views.entry(view).or_default().insert(score.clone(), value);
+        }
+    }
+    let scores = |(view, scores): (String, Map<String, Value>)| {
+        let scores = serde_json::from_value(scores.into());
+        let scores = scores.map_err(|e| FileError::malformed(&path, format!("{view}: {e}")))?;
+        Ok((view, scores))
+    };
+    views.into_iter().map(scores).collect()
+}
+
 /// The records of `stats/train.jsonl`; empty without the file.
 pub fn steps_of(run: &Path) -> Result<Vec<StepRecord>, FileError> {
     read_log(&run.join("stats/train.jsonl"))

@@ -228,6 +228,7 @@ fn insert_entry(path: &Path, iteration: u32, entry: Value) -> Result<(), FileErr
 
 #[cfg(test)]
 mod tests {
+    use super::super::scores_by_view;
     use super::*;
     use crate::evaluate::FittedScore;
 
@@ -258,6 +259,11 @@ mod tests {
         });
         assert_eq!(read("results.json"), expected);
         assert_eq!(read("per_view.json")["ours_7"]["PSNR"]["a/c.png"], 32.0);
+        let by_view = scores_by_view(root.path(), 30).unwrap();
+        let one = |psnr| Mean { psnr, ssim: 0.5, flip: 0.25, lpips: None, fitted: None };
+        let expected = [("a/c.png", 22.0), ("b.png", 20.0)];
+        assert_eq!(by_view, expected.map(|(name, psnr)| (name.to_owned(), one(psnr))).into());
+        assert!(scores_by_view(root.path(), 31).unwrap().is_empty());
         let fitted = FittedScore { psnr: 40.0, ssim: 0.75, flip: 0.125, lpips: None };
         let views = scores(10.0).map(|view| ViewScore { fitted: Some(fitted), ..view });
         write_scores(root.path(), Split::Test, 8, &views).unwrap();

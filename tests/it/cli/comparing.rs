@@ -75,11 +75,13 @@ fn every_run_appears_once_in_the_log_and_the_table() {
     assert_eq!(stdout.matches("done before").count(), 8, "{stdout}");
     assert!(before == files(&output), "a complete comparison was changed");
 
-    // If a record is lost or truncated, only its run is repeated, with the same result.
+    // If a record is lost or truncated, and its run too, only that run is repeated, with the same result.
     let log = output.join("compare.jsonl");
     let lines = read_text(&log);
     let kept: Vec<&str> = lines.lines().take(7).collect();
     std::fs::write(&log, kept.join("\n") + "\n{\"densify\":").expect("written");
+    let lost = all[7]["run"].as_str().expect("a name");
+    std::fs::remove_dir_all(output.join("runs").join(lost)).expect("an existing folder");
     // A run with damaged records has no curves, and the output says so.
     let run = all[0]["run"].as_str().expect("a name");
     std::fs::write(output.join("runs").join(run).join("stats/train.jsonl"), "{\n")
@@ -133,8 +135,8 @@ fn all_policies_are_run_and_ranked() {
         assert!(has(1, 0) && has(0, 2), "{name}: {stdout}");
         assert!(table.contains(&format!("| {name} |")), "{name}: {table}");
     }
-    assert!(stdout.contains("from vanilla") && stdout.contains("320: end"), "{stdout}");
-    assert!(table.contains("### Budget of 320\n"), "{table}");
+    assert!(stdout.contains("from vanilla") && stdout.contains("320 rows: end"), "{stdout}");
+    assert!(table.contains("### At most 320 rows\n"), "{table}");
 }
 
 #[test]
@@ -263,7 +265,12 @@ fn parallel_runs_match_sequential_ones() {
     assert!(stdout.contains("started  ") && stdout.contains("[8/8]"), "{stdout}");
     assert_eq!(results(&output), results(&alone));
     // A failed run is named with its error message.
-    let wrong =
-        compare(scene.path(), &output, "--engine local -- --sh-degree 0 --threads 1 --memory 1MiB");
+    let blocked = root.path().join("blocked");
+    let run = results(&alone)[0][0].as_str().expect("a name").to_owned();
+    std::fs::create_dir_all(blocked.join("runs")).expect("a folder");
+    std::fs::write(blocked.join("runs").join(&run), "").expect("written");
+    let wrong = compare(scene.path(), &blocked, &format!("--engine local {flags}"));
+    wrong.refused("a file in the way", &[&run, "is not a folder"]);
+    let wrong = compare(scene.path(), &root.path().join("small"), "-- --memory 1MiB");
     wrong.refused("too little memory", &["--memory"]);
 }

@@ -25,6 +25,7 @@ mod inspecting;
 mod killing;
 mod knobs;
 mod live_page;
+mod long_studies;
 mod memory;
 mod meshing;
 mod model_formats;

@@ -1,9 +1,10 @@
 //! Tabulates the Gaussians of each policy at the end and at the true peak.
 //!
-//! Budgets bound the peak, and policies are compared at equal budgets. Some policies end far below their peak, which
+//! Limits bound the peak, and policies are compared under equal limits. Some policies end far below their peak, which
 //! matters if the cost of storage or display is more important than that of training.
 
 use super::{Outcome, outcomes_at};
+use crate::Limit;
 use crate::difference::mean;
 use crate::distinct;
 use crate::text_table::{TextTable, or_dash};
@@ -23,30 +24,30 @@ fn peak_count(runs: &[&Outcome]) -> String {
     or_dash(peak.map(|rows| format!("{}{mark}", grouped(rows))))
 }
 
-/// All budgets, ascending.
-fn budgets(outcomes: &[Outcome]) -> Vec<usize> {
-    let mut budgets = distinct(outcomes.iter().map(|run| run.budget));
-    budgets.sort_unstable();
-    budgets
+/// All limits, ascending.
+fn limits(outcomes: &[Outcome]) -> Vec<Limit> {
+    let mut limits = distinct(outcomes.iter().map(Outcome::limit));
+    limits.sort_unstable();
+    limits
 }
 
-/// Adds a table per budget with the final counts and the true peaks in each scene.
+/// Adds a table per limit with the final counts and the true peaks in each scene.
 pub(super) fn add_tables(document: &mut Document, outcomes: &[Outcome], policies: &[String]) {
     document.section("Gaussians at the end and at the true peak");
     document.paragraph(
         "At the end: means over seeds. True peak: the maximum at any instant of any seed. The \
-        tables above compare policies at equal budgets, which limit the peak; these show where each policy ends.",
+        tables above compare policies under equal limits, which bound the peak; these show where each policy ends.",
     );
-    for budget in budgets(outcomes) {
+    for limit in limits(outcomes) {
         let scenes =
-            distinct(outcomes.iter().filter(|run| run.budget == budget).map(|run| &*run.scene));
+            distinct(outcomes.iter().filter(|run| run.limit() == limit).map(|run| &*run.scene));
         let title =
             |count| scenes.iter().map(move |scene| Column::text(&format!("{scene}, {count}")));
         let columns = title("at the end").chain(title("peak"));
         let mut table = Table::new(std::iter::once(Column::text("policy")).chain(columns));
         for policy in policies {
             let runs = |scene: &&str| {
-                let mut runs = outcomes_at(outcomes, scene, budget);
+                let mut runs = outcomes_at(outcomes, scene, limit);
                 runs.retain(|run| run.factor == *policy);
                 runs
             };
@@ -55,30 +56,30 @@ pub(super) fn add_tables(document: &mut Document, outcomes: &[Outcome], policies
             let cells = counts.chain(runs.iter().map(|runs| peak_count(runs)));
             table.row(std::iter::once(policy.clone()).chain(cells));
         }
-        document.subsection(&format!("Budget of {}", grouped(budget)));
+        document.subsection(&format!("At most {limit}"));
         document.table(table);
     }
 }
 
-/// Formats the counts for the terminal, over all scenes of a budget.
+/// Formats the counts for the terminal, over all scenes under a limit.
 pub(super) fn format(outcomes: &[Outcome], policies: &[String]) -> String {
-    let budgets = budgets(outcomes);
+    let limits = limits(outcomes);
     let mut titles = vec!["<policy".to_owned()];
-    for &budget in &budgets {
-        titles.extend([format!(">{}: end", grouped(budget)), ">peak".to_owned()]);
+    for limit in &limits {
+        titles.extend([format!(">{limit}: end"), ">peak".to_owned()]);
     }
     let mut table = TextTable::new(&titles.iter().map(String::as_str).collect::<Vec<_>>());
     for policy in policies {
         let mut cells = vec![policy.clone()];
-        for &budget in &budgets {
-            let is_included = |run: &&Outcome| run.budget == budget && run.factor == *policy;
+        for &limit in &limits {
+            let is_included = |run: &&Outcome| run.limit() == limit && run.factor == *policy;
             let runs: Vec<&Outcome> = outcomes.iter().filter(is_included).collect();
             cells.extend([final_count(&runs), peak_count(&runs)]);
         }
         table.row(cells);
     }
     format!(
-        "Gaussians at the end (mean over runs) and at the true peak (maximum), by budget\n\n{table}"
+        "Gaussians at the end (mean over runs) and at the true peak (maximum), by limit\n\n{table}"
     )
 }
 
@@ -93,7 +94,7 @@ mod tests {
     }
 
     #[test]
-    fn final_counts_and_peaks_are_listed_for_every_budget() {
+    fn final_counts_and_peaks_are_listed_for_every_limit() {
         let all = [
             run("a", "room", 9000, 0, [8000, 9000]),
             run("a", "room", 9000, 1, [8501, 8999]),
@@ -107,14 +108,14 @@ mod tests {
         add_tables(&mut document, &all, &policies);
         let text = document.to_string();
         let expected = "
-### Budget of 500
+### At most 500 rows
 
 | policy | room, at the end | room, peak |
 |---|---|---|
 | a | 499 | 500 |
 | b | – | – |
 
-### Budget of 9,000
+### At most 9,000 rows
 
 | policy | room, at the end | cup, at the end | room, peak | cup, peak |
 |---|---|---|---|---|
@@ -125,9 +126,9 @@ mod tests {
         let text = format(&all, &policies);
         // (8000 + 8501 + 7000) / 3 = 7833.67.
         let expected = "
-policy  500: end  peak  9,000: end          peak
-a            499   500       7,834         9,000
-b              –     –       2,350  9,001 (over)";
+policy  500 rows: end  peak  9,000 rows: end          peak
+a                 499   500            7,834         9,000
+b                   –     –            2,350  9,001 (over)";
         assert!(text.ends_with(expected), "{text}");
     }
 }

@@ -1,4 +1,4 @@
-//! Compares crops of renders: the same window of the same view for every policy at equal budget.
+//! Compares crops of renders: the same window of the same view for every policy under the same limit.
 //!
 //! The window is chosen by a fixed rule: of all windows of all test photographs, the one with the most edges.
 
@@ -7,11 +7,10 @@ use std::path::Path;
 use densify_policies::policy::Needs;
 use image::{RgbImage, imageops};
 
-use super::{Outcome, outcomes_at, scenes_and_budgets};
+use super::{Outcome, outcomes_at, scenes_and_limits};
 use crate::Picture;
 use crate::window::Window;
 use densify_core::image::SharedImage;
-use densify_core::numbers::grouped;
 use densify_data::views::{DatasetViews, ViewSource};
 use densify_run::failure::Failure;
 use densify_run::finished::{Machine, open_run};
@@ -25,7 +24,7 @@ const MIN_WIDTH: u32 = 480;
 /// Space between crops `[px]`.
 const GAP: u32 = 6;
 
-/// Draws a row of crops for each scene and budget: the photograph, then each policy at the first seed. Runs whose model
+/// Draws a row of crops for each scene and limit: the photograph, then each policy at the first seed. Runs whose model
 /// file no longer exists are left out.
 pub(super) fn draw(
     output: &Path,
@@ -33,15 +32,15 @@ pub(super) fn draw(
     observer: &dyn Observer,
 ) -> Result<Vec<Picture>, Failure> {
     let mut pictures = Vec::new();
-    for (scene, budget) in scenes_and_budgets(outcomes) {
-        let (crops, names) = crops(output, &outcomes_at(outcomes, scene, budget), observer)?;
+    for (scene, limit) in scenes_and_limits(outcomes) {
+        let (crops, names) = crops(output, &outcomes_at(outcomes, scene, limit), observer)?;
         if crops.is_empty() {
             continue;
         }
-        let file = format!("crops-{scene}-{budget}.png");
+        let file = format!("crops-{scene}-{}.png", limit.word());
         write_png(&output.join(&file), &side_by_side(&crops, GAP).into())?;
         let order = names.join(", ");
-        let caption = format!("{scene}, {} rows, from the left: {order}", grouped(budget));
+        let caption = format!("{scene}, {limit}, from the left: {order}");
         pictures.push(Picture { file, caption });
     }
     Ok(pictures)

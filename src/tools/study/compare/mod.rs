@@ -2,10 +2,14 @@
 
 mod counts;
 mod crops;
+mod decisions;
+mod exchange;
 mod plots;
 mod policy_variant;
 mod ranking;
 mod report;
+mod scene_limit;
+mod spreads;
 
 use std::collections::BTreeSet;
 use std::fmt;
@@ -18,11 +22,14 @@ use toml::Value;
 use super::difference::{Difference, Pair};
 use super::outcome::Outcome;
 use super::planned_run::PlannedRun;
-use super::{EngineArgs, Finished, Study, distinct, labels, shared_options};
-use densify_core::numbers::{self, grouped};
+use super::sequential::{Rule, SEEDS};
+use super::{EngineArgs, Finished, Limit, Study, about, distinct, labels, shared_options};
+pub use decisions::Decide;
 use densify_run::failure::Failure;
-use densify_run::{Observer, Partial};
+use densify_run::{DEFAULT_BUDGET, Observer, Partial};
 use policy_variant::PolicyVariant;
+pub use scene_limit::SceneLimit;
+use scene_limit::limits_of_scenes;
 
 /// Options of a run that the comparison sets itself.
 const OWN_OPTIONS: [&str; 8] =
@@ -40,19 +47,24 @@ Examples:
   densify compare data/room data/cup --policies vanilla,diet --budget room=28k,30k
   densify compare data/garden --policies diet,diet:rho=0,diet:full_depth=0 --budget 200k
   densify compare data/garden --policies vanilla,all --budget 200k
+  densify compare data/garden --policies diet,igs --memory 512MiB,1GiB
+  densify compare data/room data/cup --policies diet,merit --budget 200k --until-decided --hours 8
   densify compare scene:table scene:thin --policies vanilla,diet --budget 10k --iterations 3000";
 
 /// Trains a scene with several policies, under the same conditions, and says which did best.
 ///
-/// Every policy runs with every budget and every seed, one run after another. Finished runs are not
-/// repeated: after an interruption, the same command continues. The folder then holds compare.md
-/// (tables and pictures), compare.html (the same as one file), compare.jsonl (a record per run),
-/// plots as SVG, and the runs themselves. With --engine the runs can be trained on a cluster.
+/// Every policy runs under every limit with every seed, one run after another, the longest first.
+/// Finished runs are not repeated: after an interruption, the same command continues. With --hours,
+/// only what fits is started; with --until-decided, seeds are added where they are needed. With
+/// --engine the runs can be trained on a cluster. The folder then holds compare.md (tables and
+/// pictures), compare.html (the same as one file), compare.jsonl (a record per run with the scores of
+/// every view), plots as SVG, results/ (scores in the formats of NerfBaselines and 3DGS.zip), and the
+/// runs themselves.
 ///
-/// Quality is measured on held-out views. Differences are between runs of the same scene, budget and
+/// Quality is measured on held-out views. Differences are between runs of the same scene, limit and
 /// seed, against the first policy named, with 95 % intervals of their mean for three seeds or more;
 /// policies are ranked by that mean. A run whose peak exceeded its budget is marked and not ranked.
-/// The budget bounds the peak, and some policies end far below it, so the number of Gaussians at the
+/// The limit bounds the peak, and some policies end far below it, so the number of Gaussians at the
 /// end is shown beside the peak. Where the geometry is known (built-in scenes, and those that
 /// `densify scenegen` wrote), the tables also show how well the Gaussians match it.
 #[derive(Debug, Clone, Args)]
@@ -68,11 +80,23 @@ pub struct Comparison {
     pub policies: Vec<String>,
     /// Budgets in Gaussians, separated by commas; SCENE=ROWS is for one scene, named by its folder,
     /// which then has no other budgets
-    #[arg(short, long, value_name = "ROWS", value_delimiter = ',', required = true, value_parser = SceneBudget::parse)]
-    pub budget: Vec<SceneBudget>,
-    /// Number of runs of each policy at each budget, with seeds 0, 1, …
+    #[arg(short, long, value_name = "ROWS", value_delimiter = ',', required_unless_present = "memory", value_parser = SceneLimit::rows)]
+    pub budget: Vec<SceneLimit>,
+    /// Limits of the memory of each run, instead of budgets or in addition; a policy that needs less per
+    /// Gaussian then has more of them. Spelled like --budget
+    #[arg(long, value_name = "BYTES", value_delimiter = ',', value_parser = SceneLimit::memory)]
+    pub memory: Vec<SceneLimit>,
+    /// Number of runs of each policy under each limit, with seeds 0, 1, …; with --until-decided, the
+    /// number to begin with
     #[arg(long, value_name = "K", default_value_t = 3, value_parser = clap::value_parser!(u32).range(1..=1000))]
     pub seeds: u32,
+    /// Add seeds until it is decided whether each policy is better than the first, worse, or not worse,
+    /// on every scene or in the mean over the scenes; the rule is shown before `[default: scenes]`
+    #[arg(long, value_name = "WHAT", num_args = 0..=1, require_equals = true, default_missing_value = "scenes")]
+    pub until_decided: Option<Decide>,
+    /// Largest number of seeds with --until-decided
+    #[arg(long, value_name = "K", default_value_t = 12, value_parser = clap::value_parser!(u32).range(SEEDS), requires = "until_decided")]
+    pub max_seeds: u32,
     /// Length of each run
     #[arg(short, long, value_name = "N", default_value_t = 7_000, value_parser = clap::value_parser!(u32).range(1..))]
     pub iterations: u32,
@@ -87,35 +111,6 @@ pub struct Comparison {
     pub engine: EngineArgs,
 }
 
-/// A budget for all scenes, or for one.
-#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
-pub struct SceneBudget {
-    /// Label of the scene, if the budget is for one scene only.
-    pub scene: Option<String>,
-    /// Maximum number of Gaussians.
-    pub rows: usize,
-}
-
-impl fmt::Display for SceneBudget {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match &self.scene {
-            Some(scene) => write!(f, "{scene}={}", self.rows),
-            None => write!(f, "{}", self.rows),
-        }
-    }
-}
-
-impl SceneBudget {
-    /// Reads `ROWS`, or `SCENE=ROWS` with the label of a scene.
-    pub(crate) fn parse(text: &str) -> Result<Self, String> {
-        let (scene, rows) = match text.rsplit_once('=') {
-            Some((scene, rows)) => (Some(scene.to_owned()), rows),
-            None => (None, text),
-        };
-        Ok(Self { scene, rows: numbers::rows(rows)? })
-    }
-}
-
 impl Comparison {
     /// Trains the runs that are not done yet, all with the options `train`, and writes tables and pictures; `None`
     /// while a scheduler still has unfinished runs.
@@ -125,10 +120,25 @@ impl Comparison {
         observer: &dyn Observer,
     ) -> Result<Option<Finished>, Failure> {
         let policies = all_policies(&self.policies)?;
+        let rule = self.rule(&policies)?;
         let runs = self.plan_runs(&policies, train)?;
-        let mut study = Study::open(&self.output, "compare", observer)?;
-        let Some(outcomes) = study.run(&runs, &self.engine)? else { return Ok(None) };
+        let mut study = Study::open(&self.output, "compare", &self.engine, observer)?;
+        if let Some((_, _, text)) = &rule {
+            observer.say(format_args!("rule     {text}"));
+        }
+        let Some(outcomes) = self.train(&runs, &policies, rule.as_ref(), &mut study)? else {
+            return Ok(None);
+        };
+        if outcomes.is_empty() {
+            return Err(Failure::input("no run is done yet; give --hours more"));
+        }
         let mut document = report::document(&outcomes, &policies);
+        let mut summary = report::summary(&outcomes, &policies);
+        if let Some((decide, rule, text)) = &rule {
+            let cases = decisions::cases(&outcomes, &policies, *decide, *rule);
+            decisions::add(&mut document, &cases, text);
+            summary += &format!("\n{}\n", decisions::format(&cases));
+        }
         document.section("Pictures");
         for picture in plots::draw(&self.output, &outcomes, &policies, observer)? {
             document.picture(picture.file, picture.caption);
@@ -139,16 +149,77 @@ impl Comparison {
             document.paragraph(text);
         }
         report::add_options(&mut document, &outcomes)?;
-        study.finish("compare", &document, report::summary(&outcomes, &policies)).map(Some)
+        exchange::write(&self.output, &outcomes, &policies)?;
+        study.finish(&document, summary).map(Some)
     }
 
-    /// All runs in the order of training: seed after seed, so that an interrupted comparison is still fair.
+    /// The rule of `--until-decided`, with its text.
+    fn rule(&self, policies: &[String]) -> Result<Option<(Decide, Rule, String)>, Failure> {
+        let Some(decide) = self.until_decided else { return Ok(None) };
+        self.engine.require_here("--until-decided")?;
+        let [base, _, ..] = policies else {
+            return Err(Failure::input("--until-decided: name at least two policies"));
+        };
+        if self.max_seeds < self.seeds {
+            return Err(Failure::input(format!(
+                "--seeds {} is more than --max-seeds {}; lower one or raise the other",
+                self.seeds, self.max_seeds
+            )));
+        }
+        let rule = Rule::new(self.max_seeds);
+        Ok(Some((decide, rule, decide.text(rule, base))))
+    }
+
+    /// Trains the runs of the first seeds, and then those that the rule asks for. Returns the outcomes; `None` while
+    /// a scheduler has unfinished runs.
+    fn train(
+        &self,
+        runs: &[PlannedRun],
+        policies: &[String],
+        rule: Option<&(Decide, Rule, String)>,
+        study: &mut Study<'_>,
+    ) -> Result<Option<Vec<Outcome>>, Failure> {
+        let at_first = |run: &&PlannedRun| run.seed < self.seeds;
+        let mut next: Vec<PlannedRun> = runs.iter().filter(at_first).cloned().collect();
+        if rule.is_some() && study.seconds_of(&next)? > 0.0 {
+            let further: Vec<PlannedRun> =
+                runs.iter().filter(|run| run.seed == self.seeds).cloned().collect();
+            let seconds = study.seconds_of(&further)?;
+            study.observer.say(format_args!(
+                "seeds    {} to begin with, at most {}; a further one of all comparisons takes {}",
+                self.seeds,
+                self.max_seeds,
+                about(seconds)
+            ));
+        }
+        let mut outcomes = Vec::new();
+        while !next.is_empty() {
+            let Some(ran) = study.run(&next)? else { return Ok(None) };
+            outcomes.extend(ran.outcomes);
+            let (Some((decide, rule, _)), true) = (rule, ran.left.is_empty()) else { break };
+            let cases = decisions::cases(&outcomes, policies, *decide, *rule);
+            next = decisions::next_runs(&cases, runs, &policies[0]);
+            if !next.is_empty() {
+                let open = decisions::undecided(&cases);
+                study.observer.say(format_args!("undecided {open}: one more seed"));
+            }
+        }
+        Ok(Some(outcomes))
+    }
+
+    /// All runs that may be trained: seed after seed, so that an interrupted comparison is still fair.
     fn plan_runs(&self, policies: &[String], train: Partial) -> Result<Vec<PlannedRun>, Failure> {
-        let shared = shared_options(train, &OWN_OPTIONS)?;
+        let own_memory = if self.memory.is_empty() { &[][..] } else { &["memory"] };
+        let shared = shared_options(train, &[&OWN_OPTIONS, own_memory].concat())?;
         require_unique(&self.budget, "--budget")?;
+        require_unique(&self.memory, "--memory")?;
         let labels = labels(&self.scenes)?;
-        let budgets = budgets(&self.budget, &labels)?;
-        let smallest = budgets.iter().flatten().copied().min().unwrap_or(1);
+        let limits = limits_of_scenes(&self.budget, &self.memory, &labels)?;
+        let rows = |limit: &Limit| match limit {
+            Limit::Rows(rows) => Some(*rows),
+            Limit::Memory(_) => None,
+        };
+        let smallest = limits.iter().flatten().filter_map(rows).min().unwrap_or(DEFAULT_BUDGET);
         let variants: Vec<PolicyVariant<'_>> =
             policies.iter().map(|policy| PolicyVariant::parse(policy)).collect();
         for variant in &variants {
@@ -158,17 +229,19 @@ impl Comparison {
         let shared = Partial::option("test_iterations", steps.map(Value::from).collect::<Vec<_>>())
             .over(shared);
         let mut runs = Vec::new();
-        for seed in 0..self.seeds {
-            for ((scene, label), budgets) in self.scenes.iter().zip(&labels).zip(&budgets) {
-                for &budget in budgets {
+        let seeds = if self.until_decided.is_some() { self.max_seeds } else { self.seeds };
+        for seed in 0..seeds {
+            for ((scene, label), limits) in self.scenes.iter().zip(&labels).zip(&limits) {
+                for &limit in limits {
                     let base =
-                        PlannedRun::new(&shared, (scene, label), budget, seed, self.iterations);
+                        PlannedRun::new(&shared, (scene, label), limit, seed, self.iterations);
                     for (policy, variant) in policies.iter().zip(&variants) {
                         runs.push(PlannedRun {
                             factor: policy.clone(),
-                            level: budget.to_string(),
-                            title: format!("{policy}, {} rows", grouped(budget)),
-                            folder: format!("{}-{budget}", variant.folder()),
+                            level: limit.word(),
+                            title: format!("{policy}, {limit}"),
+                            folder: format!("{}-{}", variant.folder(), limit.word()),
+                            set: format!("{label}, {limit}"),
                             spec: variant.options().over(base.spec.clone()),
                             ..base.clone()
                         });
@@ -205,45 +278,20 @@ fn require_unique<T: Ord + fmt::Display>(values: &[T], flag: &str) -> Result<(),
     }
 }
 
-/// The budgets of each scene: its own, or else those for all scenes.
-fn budgets(given: &[SceneBudget], labels: &[String]) -> Result<Vec<Vec<usize>>, Failure> {
-    let unknown = given.iter().find(|b| b.scene.as_ref().is_some_and(|s| !labels.contains(s)));
-    if let Some(unknown) = unknown {
-        return Err(Failure::input(format!(
-            "--budget {unknown} is for none of the scenes; they are called {}",
-            labels.join(", ")
-        )));
-    }
-    let rows_for = |scene: Option<&String>| -> Vec<usize> {
-        given.iter().filter(|b| b.scene.as_ref() == scene).map(|b| b.rows).collect()
-    };
-    let scene_budgets = |label: &String| {
-        let own = rows_for(Some(label));
-        let rows = if own.is_empty() { rows_for(None) } else { own };
-        if rows.is_empty() {
-            return Err(Failure::input(format!(
-                "--budget gives no budget for {label}; add {label}=ROWS, or ROWS for all scenes"
-            )));
-        }
-        Ok(rows)
-    };
-    labels.iter().map(scene_budgets).collect()
+/// The outcomes of a scene under a limit.
+fn outcomes_at<'a>(outcomes: &'a [Outcome], scene: &str, limit: Limit) -> Vec<&'a Outcome> {
+    outcomes.iter().filter(|run| run.scene == scene && run.limit() == limit).collect()
 }
 
-/// The outcomes of a scene at a budget.
-fn outcomes_at<'a>(outcomes: &'a [Outcome], scene: &str, budget: usize) -> Vec<&'a Outcome> {
-    outcomes.iter().filter(|run| run.scene == scene && run.budget == budget).collect()
-}
-
-/// Pairs of scene and budget, in the order of the scenes' first appearance.
-fn scenes_and_budgets(outcomes: &[Outcome]) -> Vec<(&str, usize)> {
-    let runs: Vec<(&str, usize)> = outcomes.iter().map(|run| (&*run.scene, run.budget)).collect();
+/// Pairs of scene and limit, in the order of the scenes' first appearance.
+fn scenes_and_limits(outcomes: &[Outcome]) -> Vec<(&str, Limit)> {
+    let runs: Vec<(&str, Limit)> = outcomes.iter().map(|run| (&*run.scene, run.limit())).collect();
     let scenes = distinct(runs.iter().map(|(scene, _)| *scene));
     let pairs = |scene: &str| distinct(runs.iter().copied().filter(|(other, _)| *other == scene));
     scenes.into_iter().flat_map(pairs).collect()
 }
 
-/// Difference of a policy from `base` over pairs of runs with the same scene, budget and seed that kept their budgets;
+/// Difference of a policy from `base` over pairs of runs with the same scene, limit and seed that kept their budgets;
 /// `None` if there is no pair.
 fn difference<'a>(
     outcomes: impl Iterator<Item = &'a Outcome> + Clone,
@@ -256,7 +304,7 @@ fn difference<'a>(
         outcomes.clone().filter(move |r| r.factor == policy && r.kept_its_budget())
     };
     let pairs = runs(policy).filter_map(|run| {
-        let key = |r: &'a Outcome| (&r.scene, r.budget, r.seed);
+        let key = |r: &'a Outcome| (&r.scene, r.limit(), r.seed);
         let other = runs(base).find(|other| key(other) == key(run))?;
         Some(Pair { scene: &run.scene, seed: run.seed, difference: score(run) - score(other) })
     });
@@ -284,21 +332,5 @@ mod tests {
         let all = expanded("diet:rho=0,all").expect("they are known");
         assert_eq!((all[0].as_str(), all[1..].to_vec()), ("diet:rho=0", names().collect()));
         assert!(expanded("all,diet,all").is_err_and(|message| message.contains("all twice")));
-    }
-
-    #[test]
-    fn a_scene_with_budgets_of_its_own_takes_no_others() {
-        let labels = ["room".to_owned(), "cup".to_owned()];
-        let rows = |text: &str| {
-            let given: Result<Vec<_>, _> = text.split(',').map(SceneBudget::parse).collect();
-            budgets(&given.expect("they parse"), &labels).map_err(|failure| failure.to_string())
-        };
-        assert_eq!(rows("30k"), Ok(vec![vec![30_000]; 2]));
-        assert_eq!(rows("30k,room=28k,room=1k"), Ok(vec![vec![28_000, 1_000], vec![30_000]]));
-        assert!(rows("room=28k").is_err_and(|m| m.contains("cup=ROWS")));
-        assert!(rows("30k,rom=28k").is_err_and(|m| m.contains("rom=28000") && m.contains("room")));
-        for text in ["room=", "=", "room=x"] {
-            assert!(SceneBudget::parse(text).is_err(), "{text}");
-        }
     }
 }

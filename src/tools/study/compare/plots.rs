@@ -1,15 +1,15 @@
-//! Plots quality against the budget, and Gaussians, PSNR and memory over the iterations.
+//! Plots quality against the limit, and Gaussians, PSNR and memory over the iterations.
 
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use super::{Outcome, outcomes_at, scenes_and_budgets};
+use super::{Outcome, outcomes_at, scenes_and_limits};
+use crate::Limit;
 use crate::Picture;
 use crate::difference::mean;
 use crate::distinct;
 use crate::panel::{COLOURS, Curve, Panel, svg};
 use crate::plot;
-use densify_core::numbers::grouped;
 use densify_run::Observer;
 use densify_run::failure::Failure;
 use densify_train::output::{StepRecord, steps_of};
@@ -25,49 +25,84 @@ pub(super) fn draw(
     observer: &dyn Observer,
 ) -> Result<Vec<Picture>, Failure> {
     let mut pictures = Vec::new();
-    let all = scenes_and_budgets(outcomes);
+    let all = scenes_and_limits(outcomes);
     for scene in distinct(all.iter().map(|(scene, _)| *scene)) {
-        let budgets: Vec<usize> =
-            all.iter().filter(|(other, _)| *other == scene).map(|(_, budget)| *budget).collect();
-        if budgets.len() > 1 {
-            let caption = format!("{scene}: quality against budget, means over seeds");
-            let plot = svg(&quality(outcomes, policies, scene, &budgets), PANEL)?;
-            pictures.push(plot::write(output, format!("quality-{scene}.svg"), caption, &plot)?);
+        let limits: Vec<Limit> =
+            all.iter().filter(|(other, _)| *other == scene).map(|(_, limit)| *limit).collect();
+        for axis in [&ROWS, &MEMORY] {
+            let limits: Vec<Limit> =
+                limits.iter().copied().filter(|limit| (axis.value)(*limit).is_some()).collect();
+            if limits.len() > 1 {
+                let caption = format!("{scene}: quality against {}, means over seeds", axis.word);
+                let plot = svg(&quality(outcomes, policies, scene, &limits, axis), PANEL)?;
+                let file = format!("{}-{scene}.svg", axis.file);
+                pictures.push(plot::write(output, file, caption, &plot)?);
+            }
         }
-        for budget in budgets {
-            let caption = format!(
-                "{scene}, {} rows: rows, PSNR and memory over iterations, first seed",
-                grouped(budget)
-            );
-            let growth = growth(output, &outcomes_at(outcomes, scene, budget), policies, observer);
+        for limit in limits {
+            let caption =
+                format!("{scene}, {limit}: rows, PSNR and memory over iterations, first seed");
+            let growth = growth(output, &outcomes_at(outcomes, scene, limit), policies, observer);
             let plot = svg(&growth, PANEL)?;
-            let file = format!("growth-{scene}-{budget}.svg");
+            let file = format!("growth-{scene}-{}.svg", limit.word());
             pictures.push(plot::write(output, file, caption, &plot)?);
         }
     }
     Ok(pictures)
 }
 
-/// Scores against the budget.
+/// The axis of one kind of limit.
+struct Axis {
+    /// The limit in the text.
+    word: &'static str,
+    /// The title of the axis.
+    title: &'static str,
+    /// First part of the name of the plot's file.
+    file: &'static str,
+    /// The value on the axis; `None` for limits of the other kind.
+    value: fn(Limit) -> Option<f64>,
+}
+
+const ROWS: Axis = Axis {
+    word: "budget",
+    title: "budget (rows)",
+    file: "quality",
+    value: |limit| match limit {
+        Limit::Rows(rows) => Some(rows as f64),
+        Limit::Memory(_) => None,
+    },
+};
+const MEMORY: Axis = Axis {
+    word: "memory",
+    title: "memory (MiB)",
+    file: "quality-memory",
+    value: |limit| match limit {
+        Limit::Rows(_) => None,
+        Limit::Memory(bytes) => Some(bytes as f64 / f64::from(1 << 20)),
+    },
+};
+
+/// Scores against the limit.
 fn quality(
     outcomes: &[Outcome],
     policies: &[String],
     scene: &str,
-    budgets: &[usize],
+    limits: &[Limit],
+    axis: &Axis,
 ) -> [Panel; 3] {
     let panel = |y: &'static str, score: fn(&Outcome) -> f64| Panel {
-        title: format!("{scene}: {y} against budget"),
-        x: "budget (rows)",
+        title: format!("{scene}: {y} against {}", axis.word),
+        x: axis.title,
         y,
         log_x: true,
         has_legend: true,
         curves: by_policy(policies, |policy| {
-            let point = |&budget: &usize| {
-                let runs = outcomes_at(outcomes, scene, budget).into_iter();
+            let point = |&limit: &Limit| {
+                let runs = outcomes_at(outcomes, scene, limit).into_iter();
                 let runs = runs.filter(|r| r.factor == policy && r.kept_its_budget());
-                Some(((budget as f64).ln(), mean(runs.map(score))?))
+                Some(((axis.value)(limit)?.ln(), mean(runs.map(score))?))
             };
-            budgets.iter().filter_map(point).collect()
+            limits.iter().filter_map(point).collect()
         }),
     };
     [panel("PSNR (dB)", |r| r.psnr), panel("SSIM", |r| r.ssim), panel("FLIP", |r| r.flip)]
@@ -90,9 +125,10 @@ fn growth(
         });
         records.insert(&run.run, steps);
     }
-    let (scene, budget) = runs.first().map_or(("", 0), |run| (&*run.scene, run.budget));
+    let place =
+        runs.first().map_or_else(String::new, |run| format!("{}, {}", run.scene, run.limit()));
     let panel = |y: &'static str, curve: &dyn Fn(&Outcome) -> Vec<(u32, f64)>| Panel {
-        title: format!("{scene}, {} rows: {y} over iterations", grouped(budget)),
+        title: format!("{place}: {y} over iterations"),
         x: "iteration",
         y,
         log_x: false,

@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 
 use toml::{Table, Value};
 
-use super::{Outcome, counts, difference, outcomes_at, ranking, scenes_and_budgets};
+use super::{Outcome, counts, difference, outcomes_at, ranking, scenes_and_limits, spreads};
 use crate::difference::{INTERVALS, mean};
 use crate::distinct;
 use crate::text_table::number_or_dash;
@@ -32,16 +32,17 @@ pub(super) fn document(outcomes: &[Outcome], policies: &[String]) -> Document {
         if seeds == 1 { "seed" } else { "seeds" },
     );
     let pairs =
-        format!(" are paired by scene, budget and seed. {INTERVALS}. All options are at the end.");
+        format!(" are paired by scene, limit and seed. {INTERVALS}. All options are at the end.");
     document.paragraph(Text::from(runs).code(first).plain(&pairs));
     if policies.len() > 1 {
-        document.section("Over all scenes and budgets");
+        document.section("Over all scenes and limits");
         document.table(ranking::table(outcomes, policies));
     }
     counts::add_tables(&mut document, outcomes, policies);
-    for (scene, budget) in scenes_and_budgets(outcomes) {
-        let here = outcomes_at(outcomes, scene, budget);
-        document.section(&format!("{scene}, {} rows", grouped(budget)));
+    spreads::add(&mut document, outcomes, policies);
+    for (scene, limit) in scenes_and_limits(outcomes) {
+        let here = outcomes_at(outcomes, scene, limit);
+        document.section(&format!("{scene}, {limit}"));
         let columns = [
             "policy",
             "PSNR",
@@ -49,6 +50,8 @@ pub(super) fn document(outcomes: &[Outcome], policies: &[String]) -> Document {
             "FLIP",
             "rows",
             "true peak",
+            "budget",
+            "promised memory [MiB]",
             "peak memory [MiB]",
             "time [s]",
             "processor time [s]",
@@ -57,7 +60,7 @@ pub(super) fn document(outcomes: &[Outcome], policies: &[String]) -> Document {
         let mut table = ReportTable::new(columns.map(Column::text));
         for policy in policies {
             if here.iter().any(|run| run.factor == *policy) {
-                table.row(row(policy, first, &here, budget));
+                table.row(row(policy, first, &here));
             }
         }
         document.table(table);
@@ -100,8 +103,8 @@ fn keep_common(table: &mut Table, other: &Table) {
     });
 }
 
-/// The results of a policy in a scene at a budget.
-fn row(policy: &str, first: &str, here: &[&Outcome], budget: usize) -> Vec<Text> {
+/// The results of a policy in a scene under a limit.
+fn row(policy: &str, first: &str, here: &[&Outcome]) -> Vec<Text> {
     let runs: Vec<&Outcome> = here.iter().filter(|r| r.factor == policy).copied().collect();
     let score = |score: fn(&Outcome) -> f64, digits| {
         let mean = number_or_dash(mean_of(&runs, |r| Some(score(r))), digits);
@@ -113,10 +116,12 @@ fn row(policy: &str, first: &str, here: &[&Outcome], budget: usize) -> Vec<Text>
     };
     let peak = runs.iter().map(|r| r.peak_rows).max().unwrap_or(0);
     let mut peak_cell = Text::from(grouped(peak));
-    if peak > budget {
+    if runs.iter().any(|run| !run.kept_its_budget()) {
         peak_cell = peak_cell.plain(" ").bold("over the budget: not ranked");
     }
-    let mib = |r: &Outcome| r.peak_bytes.map(|bytes| bytes as f64 / f64::from(1 << 20));
+    let in_mib = |bytes: u64| bytes as f64 / f64::from(1 << 20);
+    let mib = |r: &Outcome| r.peak_bytes.map(in_mib);
+    let budget = runs.iter().map(|r| r.budget).max().unwrap_or(0);
     let rows = mean_of(&runs, |r| Some(r.rows as f64)).unwrap_or(0.0);
     vec![
         policy.into(),
@@ -125,6 +130,8 @@ fn row(policy: &str, first: &str, here: &[&Outcome], budget: usize) -> Vec<Text>
         score(|r| r.flip, 4).into(),
         grouped(rows.round() as usize).into(),
         peak_cell,
+        grouped(budget).into(),
+        number_or_dash(mean_of(&runs, |r| Some(in_mib(r.ledger_bytes))), 0).into(),
         number_or_dash(mean_of(&runs, mib), 0).into(),
         number_or_dash(mean_of(&runs, |r| Some(r.seconds)), 1).into(),
         number_or_dash(mean_of(&runs, |r| r.cpu_seconds), 1).into(),
@@ -171,7 +178,7 @@ fn add_geometry(document: &mut Document, here: &[&Outcome], policies: &[String])
 pub(super) fn summary(outcomes: &[Outcome], policies: &[String]) -> String {
     let (ranks, counts) = (ranking::format(outcomes, policies), counts::format(outcomes, policies));
     format!(
-        "{ranks}\n\nDifferences are paired by scene, budget and seed; brackets are 95 % intervals of \
+        "{ranks}\n\nDifferences are paired by scene, limit and seed; brackets are 95 % intervals of \
          their mean.\n\n{counts}\n"
     )
 }
@@ -205,7 +212,10 @@ mod tests {
         assert!(text.contains("| b | +0.83 [-0.60, +2.27] | 3 of 3 | 1 |"), "{text}");
         assert!(text.contains("| b | 900 | 1,000 |"), "{text}");
         assert!(text.contains("| c | not ranked"), "{text}");
-        assert!(text.contains("| a | 30.67 | 0.3067 | 0.6933 | 900 | 1,000 | – |"), "{text}");
+        assert!(
+            text.contains("| a | 30.67 | 0.3067 | 0.6933 | 900 | 1,000 | 1,000 | 0 | – |"),
+            "{text}"
+        );
         assert!(text.contains("1,001 **over the budget: not ranked**"), "{text}");
         assert!(!text.contains("Geometry"), "{text}");
         let text = summary(&all, &policies);
@@ -214,7 +224,7 @@ mod tests {
             text.contains(row_of_c) && text.contains("b          31.500  +0.50, two runs"),
             "{text}"
         );
-        assert!(text.contains("policy  1,000: end          peak"), "{text}");
+        assert!(text.contains("policy  1,000 rows: end          peak"), "{text}");
     }
 
     #[test]

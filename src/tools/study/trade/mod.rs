@@ -11,7 +11,7 @@ use clap::Args;
 
 use super::outcome::Outcome;
 use super::planned_run::PlannedRun;
-use super::{EngineArgs, Finished, Study, labels, shared_options};
+use super::{EngineArgs, Finished, Limit, Ran, Study, labels, shared_options};
 use densify_core::numbers;
 use densify_run::failure::Failure;
 use densify_run::knobs::{EXACT, preset};
@@ -83,30 +83,31 @@ impl Trade {
         let shared = shared_options(train, &OWN_OPTIONS)?;
         let factors = factors(self, &shared, observer)?;
         let runs = self.plan_runs(&factors, &shared)?;
-        let mut study = Study::open(&self.output, "trade", observer)?;
-        let Some(outcomes) = study.run(&runs, &self.engine)? else { return Ok(None) };
+        let mut study = Study::open(&self.output, "trade", &self.engine, observer)?;
+        let Some(Ran { outcomes, .. }) = study.run(&runs)? else { return Ok(None) };
         let results = Results::new(self, &factors, outcomes);
         let mut document = report::document(&results);
         document.section("Plots");
         for picture in plots::draw(&self.output, &results)? {
             document.picture(picture.file, picture.caption);
         }
-        study.finish("trade", &document, report::summary(&results)).map(Some)
+        study.finish(&document, report::summary(&results)).map(Some)
     }
 
     /// All runs in the order of training, each with at most one factor changed: seed after seed, so that an interrupted
     /// study is still fair.
     fn plan_runs(&self, factors: &[Factor], shared: &Partial) -> Result<Vec<PlannedRun>, Failure> {
         let labels = labels(&self.scenes)?;
+        let limit = Limit::Rows(self.budget);
         let mut runs = Vec::new();
         for seed in 0..self.seeds {
             for (scene, label) in self.scenes.iter().zip(&labels) {
-                let base =
-                    PlannedRun::new(shared, (scene, label), self.budget, seed, self.iterations);
+                let base = PlannedRun::new(shared, (scene, label), limit, seed, self.iterations);
                 let base = PlannedRun {
                     factor: BASE.to_owned(),
                     title: "exact".to_owned(),
                     folder: "exact".to_owned(),
+                    set: label.clone(),
                     spec: Partial::option("preset", EXACT).over(base.spec.clone()),
                     scores_without_shortcuts: true,
                     ..base
