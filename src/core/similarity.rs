@@ -62,24 +62,30 @@ impl Similarity {
         if is_finite { found } else { Self::IDENTITY }
     }
 
-    /// The similarity that takes one set of cameras to another, in pairs. Both their centres and their axes count, with
-    /// the axes as long as the cameras are far apart.
+    /// The similarity that takes one set of cameras to another, in pairs: the mean of their rotations, then the least
+    /// squares of their centres.
     pub fn between_cameras(pairs: &[[Camera; 2]]) -> Self {
-        let mean = pairs.iter().map(|[from, _]| from.centre()).sum::<DVec3>() / pairs.len() as f64;
-        let square =
-            pairs.iter().map(|[from, _]| from.centre().distance_squared(mean)).sum::<f64>();
-        let length = (square / pairs.len() as f64).sqrt();
-        let length = if length > 0.0 { length } else { 1.0 };
-        let points = pairs.iter().flat_map(|pair| {
-            let of = |camera: &Camera, axis: Option<usize>| {
-                let axis = axis.map_or(DVec3::ZERO, |axis| camera.rotation.row(axis));
-                camera.centre() + length * axis - mean
-            };
-            [None, Some(0), Some(1), Some(2)].map(|axis| [0, 1].map(|which| of(&pair[which], axis)))
+        let count = pairs.len().max(1) as f64;
+        let mut rotation = DMat3::IDENTITY;
+        for _ in 0..ROUNDS {
+            let rests = pairs.iter().map(|[from, to]| {
+                let turn = to.rotation.transpose() * from.rotation * rotation.transpose();
+                DQuat::from_mat3(&turn).to_scaled_axis()
+            });
+            let rest = rests.sum::<DVec3>() / count;
+            rotation = DMat3::from_quat(DQuat::from_scaled_axis(rest)) * rotation;
+        }
+        let [from, to] = [0, 1].map(|which| {
+            pairs.iter().map(|pair: &[Camera; 2]| pair[which].centre()).sum::<DVec3>() / count
         });
-        let about_mean = Self::between(&points.collect::<Vec<_>>());
-        let Self { rotation, scale, translation } = about_mean;
-        Self { translation: translation + mean - scale * (rotation * mean), ..about_mean }
+        let (mut along, mut square) = (0.0, 0.0);
+        for [given, moved] in pairs {
+            let arm = rotation * (given.centre() - from);
+            along += arm.dot(moved.centre() - to);
+            square += arm.length_squared();
+        }
+        let scale = if along > 0.0 && square > 0.0 { along / square } else { 1.0 };
+        Self { rotation, translation: to - scale * (rotation * from), scale }
     }
 
     /// A point after the similarity.
