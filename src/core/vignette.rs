@@ -64,7 +64,7 @@ impl Vignette {
         let light = light(self.coefficients, s);
         let limited = light.clamp(DARKEST, 1.0);
         let v = encoded(limited);
-        let within = if light >= DARKEST && light <= 1.0 { alpha } else { 0.0 };
+        let within = if (DARKEST..=1.0).contains(&light) { alpha } else { 0.0 };
         Dimming {
             factor: 1.0 - alpha * (1.0 - v),
             slope: within * v / (CURVE * limited),
@@ -117,6 +117,7 @@ fn encoded(light: f32) -> f32 {
 }
 
 #[cfg(test)]
+#[allow(clippy::float_cmp, reason = "exact values")]
 mod tests {
     use super::*;
 

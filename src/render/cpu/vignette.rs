@@ -108,8 +108,8 @@ impl WithSimd for Dim<'_> {
             let place = TilePlace::new(grid, number);
             let alpha = alpha_of(target, &place);
             for (p, alpha) in alpha.iter().enumerate() {
-                for lane in 0..WIDTH {
-                    let Dimming { factor, .. } = dimming(vignette, &place, p, lane, alpha[lane]);
+                for (lane, alpha) in alpha.iter().enumerate() {
+                    let Dimming { factor, .. } = dimming(vignette, &place, p, lane, *alpha);
                     for c in 0..3 {
                         let colour = &mut tile.planes[c][p][lane];
                         *colour = dimmed(factor, *colour);

@@ -43,8 +43,8 @@ const PLANNING_BYTES: u64 = 20;
 const THREAD_BYTES: u64 = 64 << 10;
 /// The ledger assumes at least this many threads, so that it is the same for all smaller numbers.
 const MIN_THREADS: usize = 64;
-/// Maximum bytes of a copy of the exposures or poses and of their text, per byte of these.
-const STATE_TEXT: u64 = 1 + 4;
+/// Maximum bytes of a copy of the exposures, vignettes and poses and of their text, per byte of them.
+const LEARNED_TEXT: u64 = 1 + 4;
 /// Bytes of a point with its colour.
 const POINT_BYTES: u64 = (size_of::<DVec3>() + 3) as u64;
 
@@ -94,6 +94,24 @@ impl Case<'_> {
         KeptPhotographs { count: count.min(train.len()), with_masks }
     }
 
+    /// Adds the values and moments of the exposures, vignettes and poses, and returns their bytes; the same again, as text, is
+    /// in a checkpoint.
+    fn add_learned_of_views(&self, ledger: &mut Ledger) -> u64 {
+        let (choices, views) = (&self.choices, self.inputs.dataset.train.len());
+        let mut sum = 0;
+        for (is_on, what, bytes) in [
+            (choices.exposure.is_on, "exposures of the views", Exposures::bytes(views)),
+            (choices.vignette.is_on, "vignettes of the cameras", Vignettes::bytes(views)),
+            (choices.poses.is_on, "poses of the views", Poses::bytes(views)),
+        ] {
+            if is_on {
+                ledger.add_to(Section::Model, what, bytes);
+                sum += bytes;
+            }
+        }
+        sum
+    }
+
     /// All memory of a run with these needs. The solver finds the largest size with this function.
     pub(crate) fn ledger(&self, size: &RunSize, needs: &Needs) -> Ledger {
         let threads = self.choices.threads.max(MIN_THREADS);
@@ -113,31 +131,7 @@ impl Case<'_> {
         let budget = size.rows as u64;
         let float = size_of::<f32>() as u64;
         let row = float * (11 + 3 * sh_coefficients(degree) as u64);
-        // Values and moments of the exposures; the same again, as text, in a checkpoint.
-        let exposures = if self.choices.exposure.is_on {
-            Exposures::bytes(self.inputs.dataset.train.len())
-        } else {
-            0
-        };
-        if exposures > 0 {
-            ledger.add_to(Section::Model, "exposures of the views", exposures);
-        }
-        let poses = if self.choices.poses.is_on {
-            Poses::bytes(self.inputs.dataset.train.len())
-        } else {
-            0
-        };
-        if poses > 0 {
-            ledger.add_to(Section::Model, "poses of the views", poses);
-        }
-        let vignettes = if self.choices.vignette.is_on {
-            Vignettes::bytes(self.inputs.dataset.train.len())
-        } else {
-            0
-        };
-        if vignettes > 0 {
-            ledger.add_to(Section::Model, "vignettes of the cameras", vignettes);
-        }
+        let learned = self.add_learned_of_views(&mut ledger);
         if self.inputs.track_bytes > 0 {
             let bytes = self.inputs.track_bytes + train.held(0) + train.decoding(1);
             ledger.add_to(Section::Before, "colours of tracks", bytes);
@@ -168,8 +162,7 @@ impl Case<'_> {
                 ..Frame::WORLD
             },
         });
-        let text = STATE_TEXT * (exposures + vignettes + poses);
-        pass("export of the model, checkpoint", 2 * piece * row + held + text);
+        pass("export of the model, checkpoint", 2 * piece * row + held + LEARNED_TEXT * learned);
         if let Some(companion) = self.inputs.companion {
             let sizes = CompanionSize {
                 budget,

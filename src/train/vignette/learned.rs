@@ -241,6 +241,7 @@ pub fn named_vignettes<'a>(
 }
 
 #[cfg(test)]
+#[allow(clippy::float_cmp, reason = "exact values")]
 mod tests {
     use super::*;
     use glam::{DMat3, DVec3};
@@ -310,7 +311,7 @@ mod tests {
         assert!(is_dim(&found), "{found:?}");
         for step in 0..300 {
             let gradient = towards([0.8, -1.0, 0.7], values(&found, 0));
-            found.step(0, &gradient, step as f64 / 300.0);
+            found.step(0, &gradient, f64::from(step) / 300.0);
             assert!(is_dim(&found), "{found:?}");
         }
         // What would be brighter everywhere changes nothing, instead of leaving a dark ring.
@@ -322,7 +323,7 @@ mod tests {
         assert_eq!(falling([-0.2, 0.1, 0.05]), [-0.2, 0.1, 0.05]);
         for step in 0..1500 {
             let gradient = towards([-0.8, 0.0, 0.0], values(&found, 0));
-            found.step(0, &gradient, step as f64 / 1500.0);
+            found.step(0, &gradient, f64::from(step) / 1500.0);
         }
         assert!((light(values(&found, 0), 0.5) - 0.6).abs() < 0.01, "{found:?}");
     }
@@ -333,12 +334,12 @@ mod tests {
         let start = [-1.2, 0.4, 0.0];
         let mut found = vignettes(&[start], &[0]);
         for step in 0..1000 {
-            found.step(0, &[0.0; 3], step as f64 / 1000.0);
+            found.step(0, &[0.0; 3], f64::from(step) / 1000.0);
         }
         assert_eq!(values(&found, 0), start);
         for step in 0..1000 {
             let gradient = towards([-0.9, 0.2, 0.0], values(&found, 0));
-            found.step(0, &gradient, step as f64 / 1000.0);
+            found.step(0, &gradient, f64::from(step) / 1000.0);
         }
         let [at, to] = [values(&found, 0), [-0.9, 0.2, 0.0]].map(|values| light(values, 0.4));
         assert!((at - to).abs() < 0.02 && (at - light(start, 0.4)).abs() > 0.05, "{at} {to}");
