@@ -171,7 +171,7 @@ impl ConfiguredPolicy for Igs {
 impl DensityPolicy for Igs {
     fn needs(&self, _scene: &SceneInfo) -> Needs {
         let params = &self.params;
-        let map = PixelMap { error: 0.0, edge: 1.0 };
+        let map = PixelMap { edge: 1.0, ..PixelMap::default() };
         Needs {
             signals: [Signal::VisibleCount, Signal::ScreenGradientAbs, Signal::Opacity].into(),
             aux: Some(AuxRequest {
