@@ -106,6 +106,7 @@ use crate::sample::weighted;
 
 mod parameters;
 
+pub(crate) use parameters::MAX_SUM;
 pub use parameters::{IgsParams, SumScaling};
 
 crate::register_policy!(
