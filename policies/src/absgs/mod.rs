@@ -25,7 +25,8 @@
 //!
 //! Until `grow_until`, opacities are limited to `limit_opacity` every `limit_every` steps and to `reset_opacity` every
 //! `reset_every` steps, on a white background also at `white_reset_at`. At step `last_prune_at`, Gaussians less opaque
-//! than `last_prune_opacity` are pruned; nothing takes their place.
+//! than `last_prune_opacity` are pruned, at most the share `last_prune_share` of all, so that a prune soon after a reset
+//! leaves a model; nothing takes their place.
 //!
 //! **Growth is bounded** by a hard stop at the budget: Gaussians whose gradient is the largest multiple of its
 //! threshold grow first while there is room, and at the budget nothing grows until pruning has made room.
@@ -60,6 +61,7 @@
 //! | limit_opacity | 0.8 | 0 to 1, both excluded | | largest opacity after a limit |
 //! | last_prune_at | 18000 | >= 0 | step | step of the late prune; 0: none |
 //! | last_prune_opacity | 0.1 | 0 to 1 | | opacity limit of the late prune |
+//! | last_prune_share | 0.5 | 0 to 1 | Gaussians | largest share that the late prune removes |
 //!
 //! Defaults in steps are for a run of 30,000 iterations and scale with its length; intervals
 //! (`…_every`) do not shrink below 100 steps.
@@ -68,9 +70,10 @@ use crate::adc::{OpacityResets, PruneLimits, Window};
 use crate::parameters::StepParameter::{self, Interval, Step};
 use crate::plan::{EditPlan, Reset};
 use crate::policy::{DensityPolicy, Needs, PolicyResult, SceneInfo, Signal, Snapshot};
+use crate::quota::share_of_budget;
 use crate::registry::ConfiguredPolicy;
 use crate::rng::PolicyRng;
-use crate::sample::largest;
+use crate::sample::smallest;
 
 mod growth;
 mod parameters;
@@ -147,13 +150,14 @@ impl DensityPolicy for AbsGs {
                 // A refusal is counted by the plan.
                 let _ = plan.grow(row, offspring);
             }
-            prune(now, limits, plan)?;
+            prune(now, limits, 1.0, plan)?;
             plan.reset(Reset::Signals);
         }
         if self.is_last_prune(now.step) {
             plan.cause("last-prune");
             let min_opacity = self.params.last_prune_opacity as f32;
-            prune(now, PruneLimits { min_opacity, max_scale: f32::INFINITY }, plan)?;
+            let limits = PruneLimits { min_opacity, max_scale: f32::INFINITY };
+            prune(now, limits, self.params.last_prune_share, plan)?;
         }
         self.limits.plan(now.step, plan);
         self.resets.plan(now.step, plan);
@@ -167,13 +171,15 @@ impl AbsGs {
     }
 }
 
-/// Prunes the rows beyond `limits` that have no edit yet, but never the last row.
-fn prune(now: &Snapshot<'_>, limits: PruneLimits, plan: &mut EditPlan) -> PolicyResult {
+/// Prunes rows beyond `limits` that have no edit yet, the faintest first: at most this share of all rows, and never the
+/// last row.
+fn prune(now: &Snapshot<'_>, limits: PruneLimits, share: f64, plan: &mut EditPlan) -> PolicyResult {
     let mut dead = limits.dead_rows(now)?;
     dead.retain(|&row| plan.is_free(row));
-    if dead.len() == plan.rows() - plan.pruned() {
-        let spared = largest(dead.clone(), now.signal(Signal::Opacity)?, 1);
-        dead.retain(|row| !spared.contains(row));
+    let left = plan.rows() - plan.pruned();
+    let most = share_of_budget(share, now.rows()).min(left.saturating_sub(1));
+    if dead.len() > most {
+        dead = smallest(dead, now.signal(Signal::Opacity)?, most);
     }
     plan.prune_all(dead);
     Ok(())

@@ -29,6 +29,7 @@ pub struct AbsGsParams {
     pub limit_opacity: f64,
     pub last_prune_at: u32,
     pub last_prune_opacity: f64,
+    pub last_prune_share: f64,
 }
 
 impl Default for AbsGsParams {
@@ -51,6 +52,7 @@ impl Default for AbsGsParams {
             limit_opacity: 0.8,
             last_prune_at: 18_000,
             last_prune_opacity: 0.1,
+            last_prune_share: 0.5,
         }
     }
 }
@@ -65,6 +67,7 @@ impl AbsGsParams {
         in_range("min_opacity", self.min_opacity, 0.0..=1.0)?;
         in_range("max_scale", self.max_scale, 0.0..)?;
         in_range("limit_opacity", self.limit_opacity, (Excluded(0.0), Excluded(1.0)))?;
-        in_range("last_prune_opacity", self.last_prune_opacity, 0.0..=1.0)
+        in_range("last_prune_opacity", self.last_prune_opacity, 0.0..=1.0)?;
+        in_range("last_prune_share", self.last_prune_share, 0.0..=1.0)
     }
 }

@@ -70,14 +70,17 @@ fn faint_and_huge_rows_are_pruned() {
 #[test]
 fn faint_rows_are_pruned_once_late_in_the_run() {
     let late = event(18_000, &[1.0; 3], &[1.0; 3], &[0.1; 3], 99)
-        .with(Signal::Opacity, &[0.11, 0.09, f32::NAN]);
-    let done = run(&late, "");
+        .with(Signal::Opacity, &[0.11, 0.09, 0.08]);
+    let all = "last_prune_share = 1.0";
+    let done = run(&late, all);
     assert_eq!((done.pruned, done.split.len()), (vec![1, 2], 0));
     assert_eq!((done.ops.cause.as_str(), done.ops.clamp_opacity), ("last-prune", None));
-    assert_eq!(run(&late, "last_prune_opacity = 0.2").pruned, [1, 2]);
+    assert_eq!(run(&late, &format!("{all}\nlast_prune_opacity = 0.2")).pruned, [1, 2]);
+    // At most half of the rows are pruned, the faintest.
+    assert_eq!(run(&late, "").pruned, [2]);
     // The late prune may coincide with growth, after which one row is left.
     let twice = Event { step: 600, ..late }.with(Signal::Opacity, &[0.003, 0.004, 0.05]);
-    let done = run(&twice, "last_prune_at = 600\ntau_abs = 9.0");
+    let done = run(&twice, "last_prune_at = 600\ntau_abs = 9.0\nlast_prune_share = 1.0");
     assert_eq!((done.pruned, done.ops.rows_after), (vec![0, 1], 1));
     let done = run(&twice, "last_prune_at = 600\ntau_abs = 9.0\nmin_opacity = 0.01");
     let counts = EditCounts { removed: 2, added: 0, updated: 0, denied: 0 };

@@ -25,7 +25,8 @@
 //! 1/(10⁻⁶ + 1 − pruning score). Then opacities are limited to `limit_opacity`.
 //!
 //! **Late pruning**, every `late_prune_every` steps between `grow_until` and `late_prune_until`: Gaussians less opaque
-//! than `late_prune_opacity` or with a pruning score above `late_prune_score` are pruned.
+//! than `late_prune_opacity` or with a pruning score above `late_prune_score` are pruned, at most the share
+//! `late_prune_share` of all.
 //!
 //! Opacities are reset as in `vanilla`. **The optimiser** steps at every iteration up to `sum_from` (for SH bands 1–3,
 //! whose learning rate is `sh_rest`, once per `sh_every`), then once per `sum` iterations and after `sum_more_from` once
@@ -49,6 +50,7 @@
 //! - `sh_every`, `sum` and `sum_more` scale with the length of the run, so that a short run has about as many optimiser
 //!   steps of each kind as a full one if it has enough iterations; `sums = "fixed"` prevents it.
 //! - The published rasteriser leaves out more of each Gaussian's faint rim than ours (its compact box), for speed.
+//! - The published late pruning has no limit, and leaves nothing where opacities have just been reset.
 //! - At least one Gaussian is always kept.
 //!
 //! ## Parameters
@@ -77,6 +79,7 @@
 //! | late_prune_until | 30000 | >= 0 | step | end of late pruning (exclusive) |
 //! | late_prune_opacity | 0.1 | 0 to 1 | | opacity below which late pruning removes a Gaussian |
 //! | late_prune_score | 0.9 | 0 to 1 | | pruning score above which late pruning removes a Gaussian |
+//! | late_prune_share | 0.5 | 0 to 1 | Gaussians | largest share that a late pruning removes, the faintest first |
 //! | sh_every | 16 | 1 to 1000 | steps | iterations per optimiser step of SH bands 1–3 |
 //! | sh_rest | 0.00025 | > 0 | | learning rate of SH bands 1–3 |
 //! | sum_from | 15000 | >= 0 | step | start of summing gradients over `sum` iterations (exclusive) |
@@ -97,9 +100,10 @@ use crate::policy::{
     AuxColumn, AuxRequest, AuxView, Cadence, DensityPolicy, Needs, PixelMap, PolicyResult, Rate,
     RateOverrides, SceneInfo, Signal, Snapshot,
 };
+use crate::quota::share_of_budget;
 use crate::registry::ConfiguredPolicy;
 use crate::rng::PolicyRng;
-use crate::sample::weighted;
+use crate::sample::{smallest, weighted};
 use score::ViewScores;
 
 mod parameters;
@@ -277,6 +281,10 @@ impl FastGs {
             limits.exceeded(opacity[row], 0.0) || score[row] > late_prune_score as f32
         };
         let mut pruned: Vec<u32> = (0..now.rows() as u32).filter(is_pruned).collect();
+        let most = share_of_budget(self.params.late_prune_share, now.rows());
+        if pruned.len() > most {
+            pruned = smallest(pruned, opacity, most);
+        }
         spare_one(&mut pruned, opacity);
         plan.prune_all(pruned);
         Ok(())

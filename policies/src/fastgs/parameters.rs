@@ -35,6 +35,7 @@ pub struct FastGsParams {
     pub late_prune_until: u32,
     pub late_prune_opacity: f64,
     pub late_prune_score: f64,
+    pub late_prune_share: f64,
     pub sh_every: u32,
     pub sh_rest: f64,
     pub sum_from: u32,
@@ -69,6 +70,7 @@ impl Default for FastGsParams {
             late_prune_until: 30_000,
             late_prune_opacity: 0.1,
             late_prune_score: 0.9,
+            late_prune_share: 0.5,
             sh_every: 16,
             sh_rest: 2.5e-4,
             sum_from: 15_000,
@@ -101,6 +103,7 @@ impl FastGsParams {
         in_range("limit_opacity", self.limit_opacity, open_unit)?;
         in_range("late_prune_opacity", self.late_prune_opacity, 0.0..=1.0)?;
         in_range("late_prune_score", self.late_prune_score, 0.0..=1.0)?;
+        in_range("late_prune_share", self.late_prune_share, 0.0..=1.0)?;
         in_range("sh_every", self.sh_every.into(), 1.0..=1000.0)?;
         in_range("sh_rest", self.sh_rest, (Excluded(0.0), Unbounded))?;
         in_range("sum", self.sum.into(), 1.0..=MAX_SUM.into())?;

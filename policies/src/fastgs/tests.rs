@@ -55,6 +55,9 @@ fn only_rows_with_wrong_pixels_in_several_views_grow() {
 fn late_pruning_removes_faint_rows_and_those_that_remain_wrong() {
     // Σ L·n: 1.6 + 0.3 + 0.7 = 2.6; 2.4; 0.2 + 0.1 = 0.3. Scaled: 1; 2.1/2.3 = 0.913; 0.
     let late = event(18_000, &THREE_VIEWS, 99);
+    // At most half of the rows are pruned.
+    assert_eq!(run(&late, "").pruned.len(), 1);
+    let run = |event: &Event, set: &str| run(event, &format!("late_prune_share = 1.0\n{set}"));
     let done = run(&late, "");
     assert_eq!((done.pruned, done.ops.cause.as_str()), (vec![0, 1], "late-prune"));
     assert_eq!((done.split.len(), done.ops.clamp_opacity), (0, None));
@@ -153,7 +156,7 @@ fn other_parameter_values_conform() {
         "fastgs",
         &[
             "wrong_pixels = 0\ntau = 0.0\ntau_abs = 0.0\nviews = 1",
-            "prune_share = 1.0\nmin_opacity = 1.0\nlate_prune_opacity = 1.0\nlate_prune_score = 0.0",
+            "prune_share = 1.0\nmin_opacity = 1.0\nlate_prune_opacity = 1.0\nlate_prune_score = 0.0\nlate_prune_share = 1.0",
             "sums = \"fixed\"\nmax_scale = 0.1\nmax_scale_from = 0\nsmall = 0.0",
         ],
     );

@@ -55,7 +55,8 @@
 //! - Rules of the published trainer that are no density control are not part of this policy: a loss of edges, 0.22
 //!   instead of 0.2 as the weight of SSIM, terms for flat Gaussians and for colours, a model of exposures.
 //! - The published code has 175 events 163 steps apart. In a short run an event stands for m of them: its growth is
-//!   (1 + `growth`)ᵐ − 1, at most all candidates, and its decay m times as large, at most five times.
+//!   (1 + `growth`)ᵐ − 1, at most all candidates, and its decay m times as large, but at most five times as large per
+//!   optimiser step.
 //!
 //! ## Parameters
 //!
@@ -205,9 +206,7 @@ impl DensityPolicy for Mrnf {
         let chances: Vec<f32> = (0..now.rows()).map(chance).collect();
         let room = plan.room();
         let mut parents = weighted(&chances, replaced.min(room), rng);
-        if replaced > 0 {
-            plan.cause("replace");
-        }
+        plan.cause("replace");
         if self.schedule.grow.is_due(now.step) {
             plan.cause("grow");
             let free = room - parents.len();

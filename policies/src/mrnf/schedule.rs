@@ -6,8 +6,9 @@ use crate::parameters::REFERENCE_ITERATIONS;
 /// Steps between two events of the published code, in a run of 30,000.
 const PUBLISHED_INTERVAL: u32 = 163;
 
-/// Largest number of published events whose decay one event applies: in between, opacities must recover.
-const MOST_DECAYS: f64 = 5.0;
+/// Largest decay per optimiser step, relative to the published one: Gaussians that are needed must recover between
+/// events, or all of them fade. In short runs the trainer increases learning rates by at most this factor.
+const MOST_DECAY: f64 = 5.0;
 
 /// Events of a run.
 #[derive(Debug, Clone, Copy)]
@@ -33,7 +34,8 @@ impl Schedule {
 
     /// Factor on the decay of a published event.
     pub(super) fn decay_factor(&self) -> f64 {
-        self.published_events().min(MOST_DECAYS)
+        let per_step = f64::from(self.events.every) / f64::from(PUBLISHED_INTERVAL);
+        self.published_events().min(MOST_DECAY * per_step)
     }
 
     /// Number of events with growth from that at `step` on, at least 1.

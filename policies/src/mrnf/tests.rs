@@ -58,9 +58,13 @@ fn a_short_run_grows_and_decays_faster_per_event() {
     let short = Event { scene, ..event(100, 1000, 100_000) };
     let done = run(&short, "");
     assert_eq!(done.split.len(), 514);
-    // The decay is at most five times as large: 5 · 0.004 · (1 − 1/30).
-    let decay = done.ops.decay.unwrap();
-    assert!((decay.opacity - 0.02 * 29.0 / 30.0).abs() < 1e-7, "{decay:?}");
+    // Decay is at most five times as large per step: 5 · 100/163 · 0.004 · (1 − 1/30) instead of 6.135 · ….
+    let decay = |done: &Outcome| done.ops.decay.unwrap().opacity;
+    assert!((decay(&done) - 5.0 / 1.63 * 0.004 * 29.0 / 30.0).abs() < 1e-7);
+    // In a run of 10,000 steps m is 1.84.
+    let scene = SceneInfo { iterations: 10_000, ..short.scene.clone() };
+    let longer = run(&Event { scene, ..short.clone() }, "grow_every = 100");
+    assert!((decay(&longer) - 3.0 / 1.63 * 0.004 * 0.99).abs() < 1e-7);
     // In very short runs each candidate has one child.
     let scene = SceneInfo { iterations: 300, ..short.scene.clone() };
     assert_eq!(run(&Event { scene, budget: 3000, ..short }, "").split.len(), 1000);
@@ -94,7 +98,10 @@ fn faded_rows_are_replaced_by_children_of_opaque_ones() {
         .with(Signal::VisibleCount, &[1.0, 1.0, 1.0, 1.0, 0.0, 1.0]);
     let done = run(&event, "");
     assert_eq!((done.pruned, done.split.len()), (vec![0, 2], 2));
-    assert!(done.split.iter().all(|row| [1, 3, 5].contains(row)));
+    for step in (1..=20).map(|event| 20_049 + 163 * event) {
+        let split = run(&Event { step, ..event.clone() }, "").split;
+        assert!(split.iter().all(|row| [1, 3, 5].contains(row)), "{split:?}");
+    }
     assert_eq!((done.ops.rows_after, done.ops.cause.as_str()), (6, "replace"));
     assert_eq!(done.ops.offspring(&done.ops.families[0]), split_long_axis(0.45, 0.6));
     assert!(!done.ops.reset_signals.is_empty());
@@ -102,6 +109,9 @@ fn faded_rows_are_replaced_by_children_of_opaque_ones() {
     let growing = Event { step: 14_996, budget: 7, ..event };
     let done = run(&growing, "growth = 1.0");
     assert_eq!((done.ops.rows_after, done.split.len(), done.ops.counts.denied), (7, 3, 0));
+    // An event that only decays has a cause, too.
+    let idle = run(&self::event(20_049, 2, 2), "").ops;
+    assert_eq!((idle.counts.removed, idle.cause.as_str()), (0, "replace"));
     // One row is always left.
     let done = run(&growing.with(Signal::Opacity, &[0.001; 6]), "");
     assert_eq!(done.ops.rows_after, 1 + 1);
