@@ -17,11 +17,11 @@ pub(crate) const ABS_GROWTH_SIGNALS: [Signal; 5] = [
 /// Thresholds of growth by two gradients (AbsGS, Ye et al. 2024, section 4).
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct AbsGrowth {
-    /// Screen gradient from which small rows are cloned [1 / NDC], >= 0.
+    /// Screen gradient from which small rows are cloned `[1 / NDC]`, >= 0.
     pub(crate) tau: f64,
-    /// Absolute screen gradient from which large rows are split [1 / NDC], >= 0.
+    /// Absolute screen gradient from which large rows are split `[1 / NDC]`, >= 0.
     pub(crate) tau_abs: f64,
-    /// Largest size of a small row [fraction of the scene extent], >= 0.
+    /// Largest size of a small row `[fraction of the scene extent]`, >= 0.
     pub(crate) small: f64,
     /// A split divides the scales by this, >= 1.
     pub(crate) split_factor: f64,

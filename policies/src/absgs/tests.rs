@@ -3,7 +3,7 @@
 use super::*;
 use crate::adc::{clone_at, split_by};
 use crate::event::{Event, Outcome, assert_conforms, due_steps};
-use crate::plan::EditCounts;
+use crate::plan::{EditCounts, Offspring};
 
 fn run(event: &Event, set: &str) -> Outcome {
     event.run("absgs", set)
@@ -32,7 +32,7 @@ fn gradients_that_cancel_out_split_large_rows_only() {
     let done = run(&event, "");
     assert_eq!((&done.split[..], &done.cloned[..]), (&[0][..], &[2][..]));
     let mut offspring = done.offspring();
-    offspring.sort_by_key(|children| children.siblings());
+    offspring.sort_by_key(Offspring::siblings);
     assert_eq!(offspring, [clone_at([0.0; 3]), split_by(1.6)]);
     assert_eq!((done.ops.cause.as_str(), done.ops.reset_signals.is_empty()), ("densify", false));
     // With the thresholds exchanged, the others grow.

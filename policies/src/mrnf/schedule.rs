@@ -17,7 +17,7 @@ pub(super) struct Schedule {
     pub(super) grow: Window,
     /// All events.
     pub(super) events: Window,
-    /// Length of the run [steps].
+    /// Length of the run `[steps]`.
     pub(super) iterations: u32,
 }
 
