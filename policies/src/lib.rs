@@ -7,8 +7,9 @@
 //! [`lightgaussian`] and [`radsplat`], which prune a model grown by `vanilla`; [`compact_3dgs`], which
 //! learns which Gaussians to prune; [`eagles`], coarse-to-fine images with pruning by influence;
 //! [`mini_splatting`], sampling by importance; [`reduced_3dgs`], pruning where many Gaussians share a pixel;
-//! and [`merit`], our own, replacement of hardly visible Gaussians. The crate depends on no renderer, image
-//! type or device.
+//! [`absgs`], splits by absolute gradients; [`fastgs`], the same where several views agree on an error;
+//! [`mrnf`], growth by error with decay; and [`merit`], our own, replacement of hardly visible Gaussians. The
+//! crate depends on no renderer, image type or device.
 //!
 //! # For users of gsplat
 //!
@@ -165,6 +166,7 @@
 //! therefore says `use my_policies as _;` and calls the command line of `densify`; CONTRIBUTING.md has the
 //! complete file.
 
+pub mod absgs;
 pub mod adc;
 pub mod compact_3dgs;
 pub mod conformance;
@@ -174,11 +176,13 @@ mod edit;
 mod error;
 #[cfg(test)]
 mod event;
+pub mod fastgs;
 pub mod igs;
 pub mod lightgaussian;
 pub mod mcmc;
 pub mod merit;
 pub mod mini_splatting;
+pub mod mrnf;
 mod needs;
 pub mod neighbours;
 mod ops;

@@ -108,10 +108,14 @@ class Candidates:
 
 @dataclass(frozen=True)
 class PixelMap:
-    """Weights of error and edges in the map that the column ``map_sum`` sums."""
+    """Weights of error and edges in the map that the column ``map_sum`` sums.
+
+    ``threshold``: with a value above 0, a pixel counts as 1 if its error, scaled to 0..1, is above it, and else as 0.
+    """
 
     error: float = 0.0
     edge: float = 0.0
+    threshold: float = 0.0
 
 
 @dataclass(frozen=True)

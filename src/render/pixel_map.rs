@@ -32,6 +32,11 @@ pub(super) fn pixel_map(
     }
     stretch(&mut error);
     stretch(&mut edge);
+    if map.threshold > 0.0 {
+        for e in &mut error {
+            *e = f32::from(u8::from(*e > map.threshold));
+        }
+    }
     error.iter().zip(&edge).map(|(e, g)| map.error * e + map.edge * g).collect()
 }
 

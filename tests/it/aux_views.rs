@@ -139,7 +139,13 @@ fn pixel_map(scene: &Scene, image: &Image, weights: PixelMap) -> Vec<f64> {
             weight(scene, p as usize) * (8.0 * luma(x, y) - sum).clamp(0.0, 255.0)
         })
         .collect();
-    let parts = normalised(&error).into_iter().zip(normalised(&edge));
+    let mut error = normalised(&error);
+    if weights.threshold > 0.0 {
+        let counted = |e: f64| if e > f64::from(weights.threshold) { 1.0 } else { 0.0 };
+        error = error.into_iter().map(counted).collect();
+        assert!(error.contains(&0.0) && error.contains(&1.0));
+    }
+    let parts = error.into_iter().zip(normalised(&edge));
     parts.map(|(e, g)| f64::from(weights.error) * e + f64::from(weights.edge) * g).collect()
 }
 
@@ -172,9 +178,10 @@ fn every_column_matches_the_reference() {
     let image = render(&model, view, &Rules::STANDARD);
     let splats = project(&model, view, &Rules::STANDARD);
     let order = by_depth(&splats);
-    let maps = [(50.0, 50.0), (1.0, 0.0), (0.0, 1.0)].map(|(error, edge)| PixelMap { error, edge });
+    let maps = [(50.0, 50.0, 0.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (1.0, 0.0, 0.3)];
+    let maps = maps.map(|(error, edge, threshold)| PixelMap { error, edge, threshold });
     // The smallest cap forces several bands.
-    for (weights, cap) in maps.into_iter().zip([10_000, 10_000, 1]) {
+    for (weights, cap) in maps.into_iter().zip([10_000, 10_000, 1, 10_000]) {
         let pixels = pixel_map(&scene, &image, weights);
         let fronts = fronts(&scene, |each| {
             each_blended(&splats, &order, view, &Rules::STANDARD, |p, row, weight, _| {
@@ -239,7 +246,8 @@ fn every_column_matches_the_reference() {
 #[test]
 fn output_is_independent_of_threads_and_bands() {
     let scene = scene();
-    let points = AuxRequest { points: 50, ..request(PixelMap { error: 1.0, edge: 1.0 }) };
+    let points =
+        AuxRequest { points: 50, ..request(PixelMap { error: 1.0, edge: 1.0, threshold: 0.0 }) };
     for subject in repeatable() {
         let run = |cap| observe_on(&subject, &scene, &points, cap);
         let expected = run(10_000);
@@ -255,7 +263,8 @@ fn output_is_independent_of_threads_and_bands() {
 #[test]
 fn observing_does_not_affect_training() {
     let scene = scene();
-    let request = AuxRequest { points: 9, ..request(PixelMap { error: 1.0, edge: 1.0 }) };
+    let request =
+        AuxRequest { points: 9, ..request(PixelMap { error: 1.0, edge: 1.0, threshold: 0.0 }) };
     let run = |subject: &Subject, with_views: bool| {
         let mut backend = backend(subject, &scene, &request, 10_000);
         let mut observed = None;

@@ -106,6 +106,7 @@ use crate::sample::weighted;
 
 mod parameters;
 
+pub(crate) use parameters::MAX_SUM;
 pub use parameters::{IgsParams, SumScaling};
 
 crate::register_policy!(
@@ -171,7 +172,7 @@ impl ConfiguredPolicy for Igs {
 impl DensityPolicy for Igs {
     fn needs(&self, _scene: &SceneInfo) -> Needs {
         let params = &self.params;
-        let map = PixelMap { error: 0.0, edge: 1.0 };
+        let map = PixelMap { edge: 1.0, ..PixelMap::default() };
         Needs {
             signals: [Signal::VisibleCount, Signal::ScreenGradientAbs, Signal::Opacity].into(),
             aux: Some(AuxRequest {

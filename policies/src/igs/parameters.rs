@@ -8,7 +8,7 @@ use crate::parameters::{REFERENCE_ITERATIONS, in_range};
 use crate::policy::PolicyResult;
 
 /// Maximum number of iterations per optimiser step.
-const MAX_SUM: u32 = 1000;
+pub(crate) const MAX_SUM: u32 = 1000;
 
 /// Parameters of [`Igs`](super::Igs).
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -55,6 +55,20 @@ pub enum SumScaling {
     Fixed,
 }
 
+impl SumScaling {
+    /// Iterations per optimiser step in a run of this number of iterations; `sum` is that of a run of 30,000.
+    pub(crate) fn of_run(self, sum: u32, iterations: u32) -> u32 {
+        match self {
+            Self::Fixed => sum,
+            Self::Scaled => {
+                let exact =
+                    f64::from(sum) * f64::from(iterations) / f64::from(REFERENCE_ITERATIONS);
+                exact.round().clamp(1.0, f64::from(MAX_SUM)) as u32
+            }
+        }
+    }
+}
+
 impl Default for IgsParams {
     fn default() -> Self {
         Self {
@@ -93,14 +107,7 @@ impl Default for IgsParams {
 impl IgsParams {
     /// `sum` and `sum_more` for a run of this number of iterations.
     pub(super) fn scaled_sums(&self, iterations: u32) -> [u32; 2] {
-        [self.sum, self.sum_more].map(|sum| match self.sums {
-            SumScaling::Fixed => sum,
-            SumScaling::Scaled => {
-                let exact =
-                    f64::from(sum) * f64::from(iterations) / f64::from(REFERENCE_ITERATIONS);
-                exact.round().clamp(1.0, f64::from(MAX_SUM)) as u32
-            }
-        })
+        [self.sum, self.sum_more].map(|sum| self.sums.of_run(sum, iterations))
     }
 
     /// Checks ranges.

@@ -102,11 +102,12 @@ impl Needs {
         if let Some(aux) = &self.aux {
             at_least("aux.map.error", aux.map.error.into(), 0.0)?;
             at_least("aux.map.edge", aux.map.edge.into(), 0.0)?;
-            if !(0.0..1.0).contains(&aux.margin) {
-                return Err(format!(
-                    "aux.margin is {}; it must be at least 0 and below 1",
-                    aux.margin
-                ));
+            for (name, value) in
+                [("aux.margin", aux.margin), ("aux.map.threshold", aux.map.threshold)]
+            {
+                if !(0.0..1.0).contains(&value) {
+                    return Err(format!("{name} is {value}; it must be at least 0 and below 1"));
+                }
             }
         }
         if let Some(least) = self.least_resolution.filter(|least| !(*least > 0.0 && *least <= 1.0))

@@ -169,7 +169,9 @@ impl Default for AuxRequest {
 ///
 /// n scales a map to 0..1 by its minimum and maximum in the view (0 where they are equal), e(p) is the
 /// mean over channels of |I − G|, and g(p) the 8-neighbour Laplacian of the 8-bit luma of the ground
-/// truth, clipped to 0..255, with repeated borders. e and g are multiplied by the image's mask.
+/// truth, clipped to 0..255, with repeated borders. e and g are multiplied by the image's mask. With a
+/// `threshold` above 0, n(e) is replaced by 1 where it is above the threshold and by 0 elsewhere, so that its sum counts
+/// pixels.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct PixelMap {
@@ -177,4 +179,6 @@ pub struct PixelMap {
     pub error: f32,
     /// Weight of the edges, >= 0.
     pub edge: f32,
+    /// Scaled error above which a pixel counts as wrong, in `[0, 1)`; 0: errors are summed as they are.
+    pub threshold: f32,
 }

@@ -12,7 +12,8 @@ fn numbers_out_of_range_are_refused() {
     let rates = |rates| Needs { rates, ..Needs::default() };
     let fade =
         |from, to| rates(RateOverrides { fade: Some(Fade { from, to }), ..Default::default() });
-    let map = PixelMap { error: -1.0, edge: 0.0 };
+    let map =
+        |map| Needs { aux: Some(AuxRequest { map, ..Default::default() }), ..Needs::default() };
     let wrong = [
         Needs { loss_terms: LossTerms { opacity: -1.0, scale: 0.0 }, ..Needs::default() },
         Needs { loss_terms: LossTerms { opacity: 0.0, scale: f32::NAN }, ..Needs::default() },
@@ -37,7 +38,8 @@ fn numbers_out_of_range_are_refused() {
         fade(0.5, 0.0),
         Needs { start: StartRule { opacity: Some(1.0), scale: 1.0 }, ..Needs::default() },
         Needs { start: StartRule { opacity: None, scale: 0.0 }, ..Needs::default() },
-        Needs { aux: Some(AuxRequest { map, ..AuxRequest::default() }), ..Needs::default() },
+        map(PixelMap { error: -1.0, ..PixelMap::default() }),
+        map(PixelMap { threshold: 1.0, ..PixelMap::default() }),
     ];
     for needs in wrong {
         assert!(needs.check().is_err(), "{needs:?}");

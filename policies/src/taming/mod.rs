@@ -159,7 +159,8 @@ impl ConfiguredPolicy for Taming {
 impl DensityPolicy for Taming {
     fn needs(&self, _scene: &SceneInfo) -> Needs {
         let params = &self.params;
-        let map = PixelMap { error: params.error_weight as f32, edge: params.edge_weight as f32 };
+        let (error, edge) = (params.error_weight as f32, params.edge_weight as f32);
+        let map = PixelMap { error, edge, ..PixelMap::default() };
         let sh_rest = Some(Rate::constant(params.sh_rest));
         Needs {
             signals: SignalSet::from(GROWTH_SIGNALS).with(Signal::ScaleProduct),

@@ -226,7 +226,7 @@ fn views_and_cadence_follow_the_parameters() {
     assert_eq!(needs.cadence, policy.cadence(1));
     let sh_rest = Some(Rate::constant(0.5));
     assert_eq!(needs.rates, RateOverrides { sh_rest, ..RateOverrides::default() });
-    assert_eq!(needs.aux.unwrap().map, PixelMap { error: 3.0, edge: 50.0 });
+    assert_eq!(needs.aux.unwrap().map, PixelMap { error: 3.0, edge: 50.0, threshold: 0.0 });
 }
 
 #[test]
