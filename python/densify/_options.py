@@ -135,6 +135,15 @@ class Options(TypedDict, total=False):
     exposure_model: str
     """Form of the learned exposures (default: channels)"""
 
+    poses: str
+    """Refine the poses of training views: by the points of the reconstruction, then together with the model. Test views are then measured as given and from the pose that fits best. auto decides by the points (default: fixed)"""
+
+    refine_focal: bool
+    """With refined poses, adjust focal lengths by the points, too (default: false)"""
+
+    vignette: str
+    """Learn a vignette for each camera: the light that its photographs lose towards their edges. Test views are measured without it. auto needs the tracks of a reconstruction (default: off)"""
+
     on_nan: str
     """Treatment of Gaussians with a non-finite value; the model is checked at least every 100 iterations (default: prune)"""
 

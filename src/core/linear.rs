@@ -7,7 +7,8 @@ pub fn solve<const N: usize>(mut a: [[f64; N]; N], mut b: [f64; N]) -> Option<[f
             let dot: f64 = (0..j).map(|k| a[i][k] * a[j][k]).sum();
             let rest = a[i][j] - dot;
             // Rounding can make a singular matrix look definite.
-            if i == j && !(rest > 1e-14 * a[i][i].abs()) {
+            let is_definite = rest > 1e-14 * a[i][i].abs();
+            if i == j && !is_definite {
                 return None;
             }
             a[i][j] = if i == j { rest.sqrt() } else { rest / a[j][j] };
@@ -40,12 +41,11 @@ impl<const N: usize> Default for NormalEquations<N> {
 impl<const N: usize> NormalEquations<N> {
     /// Adds the equation row·x = value with a weight.
     pub fn add(&mut self, row: [f64; N], value: f64, weight: f64) {
-        for i in 0..N {
-            let weighted = weight * row[i];
-            for j in 0..N {
-                self.matrix[i][j] += weighted * row[j];
+        for ((to, right), x) in self.matrix.iter_mut().zip(&mut self.right).zip(row) {
+            for (to, other) in to.iter_mut().zip(row) {
+                *to += weight * x * other;
             }
-            self.right[i] += weighted * value;
+            *right += weight * x * value;
         }
     }
 

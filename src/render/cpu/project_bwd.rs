@@ -18,6 +18,7 @@
 //! - dL/dV = q·(1 − ρ²)·[v₁ × n; n × v₀]/|n|² − q·κ·V/det Σ,
 //! - Vᵀ·S⁻¹·V = I − n̂·n̂ᵀ in the frame of the Gaussian's axes, for log-scales and rotations.
 
+//!
 //! The camera's pose moves by a twist (v, ω), p ← p + v + ω × p. Moving it by v is moving the mean by Wᵀ·v, and turning
 //! it by ω is turning p and the Gaussian's axes, but not the direction from which its colour is seen. With dL/dp as it is
 //! before the colour's share, rᵢ = dL/d(rotation about axis i), and dL/d(mean):
@@ -187,27 +188,10 @@ impl BlockGradient {
             put!(p, x);
         }
 
-        let [a0, a1, a2] = g.axes;
-        let db0 = each!(i in 3 => d0[0] * a0[i] + d0[1] * a1[i] + d0[2] * a2[i]);
-        let db1 = each!(i in 3 => d1[0] * a0[i] + d1[1] * a1[i] + d1[2] * a2[i]);
         let rot = rotation(s, view);
         let focal = [c(view.focal[0]), c(view.focal[1])];
-        let (j00, j02) = (dot(db0, rot[0]), dot(db0, rot[2]));
-        let (j11, j12) = (dot(db1, rot[1]), dot(db1, rot[2]));
-        let Geometry { inv_z, ratio, clamped, .. } = g;
-        // J = f/z·[1, 0, −x/z; 0, 1, −y/z], its x/z and y/z constant where clamped.
-        let by_inv_z = focal[0] * (j00 - clamped[0] * j02) + focal[1] * (j11 - clamped[1] * j12);
-        let j_2 = [j02, j12];
-        let by_ratio = each!(i in 2 => {
-            let free = clamped[i].le(ratio[i]).and(ratio[i].le(clamped[i]));
-            focal[i] * (dm[i] - free.keep(inv_z * j_2[i]))
-        });
         let by_depth = if layout.has(Field::Depth) { sum!(Field::Depth.number()) } else { zero };
-        let dp = [
-            by_ratio[0] * inv_z,
-            by_ratio[1] * inv_z,
-            by_depth - inv_z * (by_ratio[0] * ratio[0] + by_ratio[1] * ratio[1] + inv_z * by_inv_z),
-        ];
+        let dp = by_position(&g, &rot, [d0, d1], (dm, focal), by_depth);
 
         // Colour: through the clamp at 0 to the coefficients, and through the direction to the mean.
         let (dir, inv_distance) = direction(s, block, at, view);
@@ -230,24 +214,71 @@ impl BlockGradient {
             put!(plane::MEAN + i, from_p + from_dir[i]);
         }
         if view.differentiates_pose {
-            let turned = each!(i in 3 => turn[0] * a0[i] + turn[1] * a1[i] + turn[2] * a2[i]);
-            let p = g.p;
-            let by_log_focal = (0..2).fold(zero, |sum, i| sum + dm[i] * focal[i] * ratio[i]);
-            let by_log_focal = by_log_focal + by_log_scale[0] + by_log_scale[1] + by_log_scale[2];
-            for i in 0..3 {
-                let (j, k) = ((i + 1) % 3, (i + 2) % 3);
-                let by_translation = dp[i] + dot(rot[i], from_dir);
-                let by_rotation = p[j] * dp[k] - p[k] * dp[j] + dot(rot[i], turned);
-                seen.keep(by_translation).store(&mut self.twist[i][at..]);
-                seen.keep(by_rotation).store(&mut self.twist[3 + i][at..]);
+            let by_position = (dp, from_dir);
+            let twist = by_twist(&g, &rot, by_position, turn, (dm, focal), by_log_scale);
+            for (line, x) in self.twist.iter_mut().zip(twist) {
+                seen.keep(x).store(&mut line[at..]);
             }
-            seen.keep(by_log_focal).store(&mut self.twist[6][at..]);
         }
 
         // dα/d(logit) = α(1 − o); 1 − o = σ(−logit) keeps its precision near o = 1.
         let logit = lanes(s, block, plane::OPACITY, at);
         put!(plane::OPACITY, q / (c(1.0) + logit.exp()));
     }
+}
+
+/// dL/dp through the projection, from d0 and d1 = dL/d(rows of J·W)·axes, dL/d(projected mean) with the focal lengths, and
+/// dL/d(depth).
+#[inline(always)]
+fn by_position<S: Simd>(
+    g: &Geometry<S>,
+    rot: &[[V<S>; 3]; 3],
+    [d0, d1]: [[V<S>; 3]; 2],
+    (dm, focal): ([V<S>; 2], [V<S>; 2]),
+    by_depth: V<S>,
+) -> [V<S>; 3] {
+    let [a0, a1, a2] = g.axes;
+    let db0 = each!(i in 3 => d0[0] * a0[i] + d0[1] * a1[i] + d0[2] * a2[i]);
+    let db1 = each!(i in 3 => d1[0] * a0[i] + d1[1] * a1[i] + d1[2] * a2[i]);
+    let (j00, j02) = (dot(db0, rot[0]), dot(db0, rot[2]));
+    let (j11, j12) = (dot(db1, rot[1]), dot(db1, rot[2]));
+    let Geometry { inv_z, ratio, clamped, .. } = *g;
+    // J = f/z·[1, 0, −x/z; 0, 1, −y/z], its x/z and y/z constant where clamped.
+    let by_inv_z = focal[0] * (j00 - clamped[0] * j02) + focal[1] * (j11 - clamped[1] * j12);
+    let j_2 = [j02, j12];
+    let by_ratio = each!(i in 2 => {
+        let free = clamped[i].le(ratio[i]).and(ratio[i].le(clamped[i]));
+        focal[i] * (dm[i] - free.keep(inv_z * j_2[i]))
+    });
+    [
+        by_ratio[0] * inv_z,
+        by_ratio[1] * inv_z,
+        by_depth - inv_z * (by_ratio[0] * ratio[0] + by_ratio[1] * ratio[1] + inv_z * by_inv_z),
+    ]
+}
+
+/// dL/d(twist of the camera), from dL/dp, the colour's part of dL/d(mean), dL/d(rotation about each local axis),
+/// dL/d(projected mean) with the focal lengths, and dL/d(log-scale); see the module's comment.
+#[inline(always)]
+fn by_twist<S: Simd>(
+    g: &Geometry<S>,
+    rot: &[[V<S>; 3]; 3],
+    (dp, from_dir): ([V<S>; 3], [V<S>; 3]),
+    turn: [V<S>; 3],
+    (dm, focal): ([V<S>; 2], [V<S>; 2]),
+    by_log_scale: [V<S>; 3],
+) -> [V<S>; TWIST_VALUES] {
+    let [a0, a1, a2] = g.axes;
+    let turned = each!(i in 3 => turn[0] * a0[i] + turn[1] * a1[i] + turn[2] * a2[i]);
+    let translation = each!(i in 3 => dp[i] + dot(rot[i], from_dir));
+    let rotation = each!(i in 3 => {
+        let (j, k) = ((i + 1) % 3, (i + 2) % 3);
+        g.p[j] * dp[k] - g.p[k] * dp[j] + dot(rot[i], turned)
+    });
+    let by_scales = by_log_scale[0] + by_log_scale[1] + by_log_scale[2];
+    let by_means = dm[0] * focal[0] * g.ratio[0] + dm[1] * focal[1] * g.ratio[1];
+    let ([x, y, z], [a, b, c]) = (translation, rotation);
+    [x, y, z, a, b, c, by_means + by_scales]
 }
 
 /// dL/d(quaternion), from dL/d(rotation about each local axis).

@@ -4,7 +4,7 @@ use std::time::Instant;
 
 use densify_policies::policy::MaskTerm;
 
-use super::frame::{due, target as target_flags};
+use super::frame::{Frame, due, target as target_flags};
 use super::observe::RenderedView;
 use super::passes::{Passes, Recorder};
 use super::{GpuBackend, Waiting, pose};
@@ -13,6 +13,7 @@ use crate::depth::{DepthLoss, DepthTerm};
 use crate::pixel_map::edge_weights;
 use crate::signals::Field;
 use crate::{BackendError, StepInput, StepOutput, assert_same_size};
+use densify_core::image::Image8;
 
 impl GpuBackend {
     /// Returns the bits of the frame ([`due`]) that tell which parameter groups this step updates and which have
@@ -30,6 +31,20 @@ impl GpuBackend {
         ];
         let bits = bits.iter().filter(|(on, _)| *on).fold(0, |all, (_, bit)| all | bit);
         (bits, Waiting { main: !main, rest: !rest })
+    }
+
+    /// Sets what the scores of rows need of the errors of pixels.
+    fn load_scores(&self, frame: &mut Frame, target: &Image8, background: [f32; 3]) {
+        let score = &self.planes.score;
+        let [by_difference, by_dissimilarity] = score.map.weights();
+        frame.errors = [0.0, 0.0, by_difference, by_dissimilarity];
+        if self.sizes.records.has(Field::Error) {
+            frame.draw[3] |= target_flags::BY_PIXEL;
+            if score.edge > 0.0 {
+                let weights = edge_weights(target, background, score);
+                self.write("edges", bytemuck::cast_slice(&weights));
+            }
+        }
     }
 
     /// Forward pass, loss, backward pass and optimiser; unless it `trains`, only the pose is differentiated.
@@ -59,19 +74,10 @@ impl GpuBackend {
         let depth = self.load_depth(&mut frame, input);
         let trained = self.sizes.budget.trained(self.rows).max(1) as f32;
         frame.add_step(input, trained, due, &self.planes);
-        if self.sizes.records.has(Field::Error) {
-            frame.draw[3] |= target_flags::BY_PIXEL;
-            let score = &self.planes.score;
-            if score.edge > 0.0 {
-                let weights = edge_weights(target, background, score);
-                self.write("edges", bytemuck::cast_slice(&weights));
-            }
-        }
+        self.load_scores(&mut frame, target, background);
         let (degree, signals) = (frame.model[1] as u8, self.planes.count > 0);
         let mask = self.mask.map(|mask| MaskTerm { weight: mask.weight / trained, ..mask });
         let pixels = camera.width * camera.height;
-        let [by_difference, by_dissimilarity] = self.planes.score.map.weights();
-        frame.errors = [0.0, 0.0, by_difference, by_dissimilarity];
         // All passes up to dL/dpixel.
         let compare = |passes: &Passes<'_>, to: &mut Recorder<'_>| {
             if depth.is_some_and(|depth| depth.term == DepthTerm::Samples) {
@@ -126,8 +132,7 @@ impl GpuBackend {
             self.collect_candidates(&rendered, &request, count, search)?;
             self.continue_view(shape, step);
             if input.pose {
-                let sums = self.read("pose total", 0, pose::SUMS)?;
-                self.pose_sums = bytemuck::pod_read_unaligned(bytemuck::cast_slice(&sums));
+                self.pose_sums = self.read_pose_sums()?;
             }
             state
         } else {

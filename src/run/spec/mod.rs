@@ -341,12 +341,11 @@ run_spec! {
         /// Form of the learned exposures
         exposure_model: ExposureModel = ExposureModel::Channels, Fixed, value "MODEL";
 
-        /// Refine the poses of the training photographs: first by the points of the reconstruction, then together with
-        /// the model. Test views are then measured both as given and from the pose that fits best. auto needs the tracks
-        /// of a reconstruction
+        /// Refine the poses of training views: by the points of the reconstruction, then together with the model. Test
+        /// views are then measured as given and from the pose that fits best. auto decides by the points
         poses: PoseChoice = PoseChoice::Fixed, Fixed, value "WHEN";
 
-        /// With refined poses, adjust the focal length of each lens by the points as well
+        /// With refined poses, adjust focal lengths by the points, too
         refine_focal: bool = false, Fixed, switch Set;
 
         /// Learn a vignette for each camera: the light that its photographs lose towards their edges. Test views are

@@ -27,6 +27,7 @@ use densify_run::{
     estimate, say_notes,
 };
 use densify_train::exposure::ExposureChoice;
+use densify_train::poses::PoseChoice;
 use densify_train::vignette::VignetteChoice;
 
 /// Minimum number of Gaussians of a block.
@@ -116,6 +117,13 @@ impl<'a> Planner<'a> {
             return Err(Failure::input(
                 "--sh-degree auto: blocks must have one degree; give 0, 1, 2 or 3",
             ));
+        }
+        if spec.schedule.poses != PoseChoice::Fixed {
+            return Err(Failure::input(format!(
+                "--poses {}: each block would move its cameras by itself, and the blocks of a model must agree; train \
+                 one model with refined poses, or leave the option out",
+                spec.schedule.poses.name()
+            )));
         }
         if spec.schedule.exposure == ExposureChoice::Auto {
             return Err(Failure::input(

@@ -187,6 +187,7 @@ fn impossible_plans_are_refused_and_write_nothing() {
     plan("--rows 400 --blocks 2 -- --budget 9").refused("the plan's", &["--budget", "plan itself"]);
     plan("--rows 400 --blocks 2 -- --sh-degree auto").refused("auto", &["--sh-degree auto"]);
     plan("--rows 400 --blocks 2 -- --coordinates double").refused("f64", &["--coordinates double"]);
+    plan("--rows 400 --blocks 2 -- --poses refine").refused("poses", &["--poses refine", "agree"]);
     plan("--rows 400 --blocks 2 -- --exposure auto")
         .refused("auto", &["--exposure auto", "give on or off"]);
     plan("--rows 400").refused("auto needs memory", &["--memory"]);
