@@ -165,8 +165,11 @@ impl OpenedModel {
             let background = opened.data.background.fixed();
             let has_exposures =
                 self.run.as_ref().is_some_and(|(config, _)| config.resolved.has_exposures);
-            let comparison =
-                Comparison { lpips: lpips.as_ref(), fits_exposure: fit_exposure || has_exposures };
+            let comparison = Comparison {
+                lpips: lpips.as_ref(),
+                fits_exposure: fit_exposure || has_exposures,
+                fits_pose: false,
+            };
             let mut check = CoordinateCheck::new(views.count());
             let (backend, degree) = (opened.backend.as_mut(), opened.sh_degree);
             let stopped = || {

@@ -88,7 +88,8 @@ struct Sighting {
     pixel: DVec2,
 }
 
-/// Adjusts the given cameras of the training views, and the focal lengths of each lens if `with_focal`; `None` if too few tracks say where photographs show their points.
+/// Adjusts the given cameras of the training views, and the focal lengths of each lens if `with_focal`; `None` if too
+/// few tracks say where photographs show their points.
 pub fn adjust(tracks: &Tracks, given: &[Camera], with_focal: bool) -> Option<Adjusted> {
     let sightings = sightings(tracks, given);
     let known = sightings.chunk_by(|a, b| a.track == b.track).filter(|all| all.len() > 1).count();
