@@ -81,7 +81,8 @@ impl Entry {
         Rendered { summary, frames, points }: &Rendered,
     ) -> Result<(), Box<dyn std::error::Error>> {
         let summary = serde_json::to_vec(summary)?;
-        let flat: Vec<f64> = points.positions.iter().flat_map(DVec3::to_array).collect();
+        let [flat, found_at] = [&points.positions, &points.found_at]
+            .map(|points| points.iter().flat_map(DVec3::to_array).collect::<Vec<f64>>());
         let counts: Vec<u32> = points.seen_by.iter().map(|views| views.len() as u32).collect();
         let seen_by = points.seen_by.concat();
         let number = points.positions.len();
@@ -93,6 +94,7 @@ impl Entry {
         for (name, kind, shape, bytes) in [
             ("about", Dtype::U8, vec![summary.len()], &summary[..]),
             ("positions", Dtype::F64, vec![number, 3], bytemuck::cast_slice(&flat)),
+            ("found_at", Dtype::F64, vec![number, 3], bytemuck::cast_slice(&found_at)),
             ("colours", Dtype::U8, vec![number, 3], points.colours.as_flattened()),
             ("view_counts", Dtype::U32, vec![number], bytemuck::cast_slice(&counts)),
             ("seen_by", Dtype::U32, vec![seen_by.len()], bytemuck::cast_slice(&seen_by)),
@@ -130,15 +132,18 @@ fn decode(tensors: &SafeTensors<'_>) -> Option<Rendered> {
         let words = bytes(name)?.as_chunks().0.iter();
         Some(words.map(|&word| u32::from_le_bytes(word)).collect())
     };
-    let numbers = bytes("positions")?.as_chunks().0.iter().map(|&word| f64::from_le_bytes(word));
-    let numbers: Vec<f64> = numbers.collect();
-    let positions = numbers.as_chunks().0.iter().map(|&point| DVec3::from_array(point)).collect();
+    let places = |name: &str| -> Option<Vec<DVec3>> {
+        let numbers = bytes(name)?.as_chunks().0.iter().map(|&word| f64::from_le_bytes(word));
+        let numbers: Vec<f64> = numbers.collect();
+        Some(numbers.as_chunks().0.iter().map(|&point| DVec3::from_array(point)).collect())
+    };
+    let (positions, found_at) = (places("positions")?, places("found_at")?);
     let colours = bytes("colours")?.as_chunks().0.to_vec();
     let mut seen = u32s("seen_by")?.into_iter();
     let counts = u32s("view_counts")?.into_iter();
     let seen_by = counts.map(|count| seen.by_ref().take(count as usize).collect()).collect();
     // The other fields of the points are not used by datasets.
-    let points = InitPoints { positions, colours, seen_by, ..InitPoints::default() };
+    let points = InitPoints { positions, found_at, colours, seen_by, ..InitPoints::default() };
     let summary: Summary = serde_json::from_slice(bytes("about")?).ok()?;
     Some(Rendered { summary, frames: frames?, points })
 }
@@ -213,6 +218,7 @@ mod tests {
         };
         let points = InitPoints {
             positions: vec![DVec3::new(1.0, -0.1, 1e-9), DVec3::splat(7.25)],
+            found_at: vec![DVec3::new(1.0, -0.2, 1e-9), DVec3::splat(7.5)],
             colours: vec![[1, 2, 3], [4, 5, 6]],
             seen_by: vec![vec![0, 2], vec![1]],
             ..InitPoints::default()
