@@ -21,9 +21,11 @@ done
 killed=''
 for _ in $(seq 600); do
     state="$("$program" blocks status "$scratch/slurm")"
-    if [ -z "$killed" ] && grep -q '^block-.*running, saved [1-9]' <<<"$state"; then
+    # A task that has a checkpoint, as others may begin again.
+    saved="$(sed -n 's/^\(block-[0-9-]*\) .*running, saved [1-9].*/\1/p' <<<"$state" | head -n 1 || true)"
+    if [ -z "$killed" ] && [ -n "$saved" ]; then
         # SIGKILL, like the system when memory runs out.
-        killed="$(pgrep -f "^$program blocks run $scratch/slurm block-" | head -n 1)"
+        killed="$(pgrep -f "^$program blocks run $scratch/slurm $saved" | head -n 1 || true)"
         [ -n "$killed" ] && kill -9 "$killed"
     fi
     grep -q '^merge *complete' <<<"$state" && break
