@@ -19,7 +19,8 @@
 // See loss.wgsl.
 const HAS_MASK: u32 = 2u;
 
-var<workgroup> reduced: array<f32, GROUP>;
+alias Summand = f32;
+const ADDERS: u32 = GROUP;
 
 // The inverse depth given in a pixel, and its confidence times its mask.
 fn given(at: u32) -> vec2<f32> {
@@ -78,18 +79,6 @@ fn differentiate(at: u32) -> f32 {
     }
     finish[frame.image.x * frame.image.y + at] = bitcast<vec2<u32>>(vec2(centre, factor));
     return value;
-}
-
-// The sum of `reduced`; valid in the first invocation.
-fn reduced_sum(lane: u32) -> f32 {
-    workgroupBarrier();
-    for (var half = GROUP / 2u; half > 0u; half /= 2u) {
-        if lane < half {
-            reduced[lane] += reduced[lane + half];
-        }
-        workgroupBarrier();
-    }
-    return reduced[0];
 }
 
 @compute @workgroup_size(256)

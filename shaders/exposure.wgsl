@@ -2,9 +2,7 @@
 // src/render/cpu/exposure.rs. A group handles 256 consecutive pixels, and an invocation of the
 // backward kernel four of them.
 
-// Three rows of a matrix, each followed by its channel's offset; then the background of the photograph.
-@group(0) @binding(1) var<storage, read> exposure: array<vec4<f32>>;
-@group(0) @binding(2) var<storage, read_write> canvas: array<vec4<f32>>;
+@group(0) @binding(1) var<storage, read_write> canvas: array<vec4<f32>>;
 // See rasterize.wgsl.
 @group(0) @binding(3) var<storage, read> finish: array<vec2<u32>>;
 // The image with the exposure, which the loss replaces by dL/dpixel; w: as in the canvas.
@@ -18,12 +16,7 @@
 // Number of invocations per group in the kernels that compute sums.
 const ADDERS: u32 = 64u;
 
-var<workgroup> reduced: array<mat4x4<f32>, ADDERS>;
-
-fn exposed_colour(rendered: vec3<f32>) -> vec3<f32> {
-    let colour = vec4(rendered, 1.0);
-    return vec3(dot(exposure[0], colour), dot(exposure[1], colour), dot(exposure[2], colour));
-}
+alias Summand = mat4x4<f32>;
 
 // Applies the photograph's exposure to the image.
 @compute @workgroup_size(256)
@@ -32,18 +25,6 @@ fn expose(@builtin(global_invocation_id) id: vec3<u32>) {
     if at < frame.image.x * frame.image.y {
         exposed[at] = vec4(exposed_colour(canvas[at].xyz), canvas[at].w);
     }
-}
-
-// The sum of `reduced`; valid in the first invocation.
-fn reduced_sum(lane: u32) -> mat4x4<f32> {
-    workgroupBarrier();
-    for (var half = ADDERS / 2u; half > 0u; half /= 2u) {
-        if lane < half {
-            reduced[lane] += reduced[lane + half];
-        }
-        workgroupBarrier();
-    }
-    return reduced[0];
 }
 
 // Replaces the image before the exposure by dL/dpixel, and computes the sums of the group.

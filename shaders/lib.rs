@@ -31,6 +31,8 @@ const STEPS: &str = shader!("shared/steps");
 const ROW: &str = shader!("shared/row");
 const NARROW: &str = shader!("shared/narrow");
 const DRAWS: &str = shader!("shared/draws");
+const EXPOSED: &str = shader!("shared/exposed");
+const REDUCE: &str = shader!("shared/reduce");
 
 /// The choices that the text of a module depends on.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -143,10 +145,10 @@ pub const STAGES: &[Stage] = &[
         .with(&[Numbers::Rows, Numbers::Colours]),
     stage("tiles", On::Emits, &[VIEW, SPLAT, FOOTPRINT, shader!("tiles")]),
     stage("rasterize", On::Tiles, &[VIEW, SPLAT, QUADS, shader!("rasterize")]),
-    stage("exposure", On::All, &[VIEW, shader!("exposure")]),
-    stage("vignette", On::All, &[VIEW, shader!("vignette")]),
-    stage("loss", On::All, &[VIEW, shader!("loss")]),
-    stage("depth_gradient", On::All, &[VIEW, shader!("depth_gradient")]),
+    stage("exposure", On::All, &[VIEW, REDUCE, EXPOSED, shader!("exposure")]),
+    stage("vignette", On::All, &[VIEW, REDUCE, EXPOSED, shader!("vignette")]),
+    stage("loss", On::All, &[VIEW, REDUCE, shader!("loss")]),
+    stage("depth_gradient", On::All, &[VIEW, REDUCE, shader!("depth_gradient")]),
     stage(
         "rasterize_bwd",
         On::Slots,
@@ -160,7 +162,7 @@ pub const STAGES: &[Stage] = &[
     stage(
         "project_bwd",
         On::All,
-        &[VIEW, RECORD, SPLAT, GAUSSIAN, DIRECTION, shader!("project_bwd")],
+        &[VIEW, RECORD, SPLAT, GAUSSIAN, DIRECTION, REDUCE, shader!("project_bwd")],
     )
     .with(&[Numbers::Rows, Numbers::Colours]),
     stage("mask", On::All, &[VIEW, RECORD, SPLAT, STEPS, shader!("mask")])

@@ -104,7 +104,8 @@ const COLUMNS: u32 = SIDE * TILE / 8u;
 // A tile with its margin: two values per pixel. Then up to four sums over columns per pixel.
 var<workgroup> around: array<vec2<f32>, 676>;
 var<workgroup> rows: array<vec4<f32>, 416>;
-var<workgroup> reduced: array<vec2<f32>, MEMBERS>;
+alias Summand = vec2<f32>;
+const ADDERS: u32 = MEMBERS;
 
 // The four neighbouring pixels of an invocation, in one line of a tile.
 struct Four {
@@ -296,18 +297,6 @@ fn score_contribution(error: f32, at: u32) -> f32 {
         map *= edges[at];
     }
     return map;
-}
-
-// The sum of `reduced`; valid in the first invocation.
-fn reduced_sum(lane: u32) -> vec2<f32> {
-    workgroupBarrier();
-    for (var half = MEMBERS / 2u; half > 0u; half /= 2u) {
-        if lane < half {
-            reduced[lane] += reduced[lane + half];
-        }
-        workgroupBarrier();
-    }
-    return reduced[0];
 }
 
 // Computes dL/dpixel. Of the image it reads only the pixels that it replaces. The last launch also computes the means

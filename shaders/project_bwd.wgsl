@@ -13,7 +13,8 @@
 // The twist of the camera in two columns: v and 0; ω and the logarithm of the focal lengths.
 alias Twist = mat2x4<f32>;
 
-var<workgroup> reduced: array<Twist, GROUP>;
+alias Summand = Twist;
+const ADDERS: u32 = GROUP;
 
 @compute @workgroup_size(256)
 fn project_bwd(@builtin(global_invocation_id) id: vec3<u32>) {
@@ -50,18 +51,6 @@ fn total_pose(@builtin(local_invocation_index) lane: u32) {
         pose_total[0] = all[0];
         pose_total[1] = all[1];
     }
-}
-
-// The sum of `reduced`; valid in the first invocation.
-fn reduced_sum(lane: u32) -> Twist {
-    workgroupBarrier();
-    for (var half = GROUP / 2u; half > 0u; half /= 2u) {
-        if lane < half {
-            reduced[lane] += reduced[lane + half];
-        }
-        workgroupBarrier();
-    }
-    return reduced[0];
 }
 
 // Replaces a row's splat and sums by its gradient, and returns the derivatives with respect to the camera's twist.

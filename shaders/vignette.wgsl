@@ -4,8 +4,6 @@
 
 // The coefficients; then the photograph's middle [px], and the size of a pixel as a share of its longer side.
 @group(0) @binding(1) var<storage, read> vignette: array<vec4<f32>>;
-// See exposure.wgsl.
-@group(0) @binding(2) var<storage, read> exposure: array<vec4<f32>>;
 @group(0) @binding(3) var<storage, read> canvas: array<vec4<f32>>;
 // The exposed image; in the backward kernel the derivatives with respect to the dimmed one.
 @group(0) @binding(4) var<storage, read_write> exposed: array<vec4<f32>>;
@@ -24,7 +22,7 @@ const CURVE: f32 = 2.4;
 // A bit of frame.draw.w.
 const HAS_ALPHA: u32 = 1u;
 
-var<workgroup> reduced: array<vec3<f32>, ADDERS>;
+alias Summand = vec3<f32>;
 
 // What the vignette does to a pixel: the factor on an encoded value, its derivative with respect to V, and r².
 fn dimming(at: u32) -> vec3<f32> {
@@ -52,18 +50,6 @@ fn dim(@builtin(global_invocation_id) id: vec3<u32>) {
     }
 }
 
-// The sum of `reduced`; valid in the first invocation.
-fn reduced_sum(lane: u32) -> vec3<f32> {
-    workgroupBarrier();
-    for (var half = ADDERS / 2u; half > 0u; half /= 2u) {
-        if lane < half {
-            reduced[lane] += reduced[lane + half];
-        }
-        workgroupBarrier();
-    }
-    return reduced[0];
-}
-
 // Replaces the derivatives with respect to the dimmed image by those with respect to the exposed one, and computes the
 // sums of the group.
 @compute @workgroup_size(64)
@@ -78,12 +64,7 @@ fn dim_bwd(
         let at = group * GROUP + k * ADDERS + lane;
         if at < size {
             let g = exposed[at].xyz;
-            let rendered = vec4(canvas[at].xyz, 1.0);
-            let colour = vec3(
-                dot(exposure[0], rendered),
-                dot(exposure[1], rendered),
-                dot(exposure[2], rendered),
-            );
+            let colour = exposed_colour(canvas[at].xyz);
             let found = dimming(at);
             let s = found.z;
             let power = dot(g, colour + CURVE_OFFSET) * found.y * s;
