@@ -1,6 +1,7 @@
 //! Training: initialisation, schedules, the training loop, checkpoints, metrics, and the output folder of a run.
 //! Prints nothing.
 
+mod adam;
 pub mod checkpoint;
 pub mod evaluate;
 pub mod exposure;

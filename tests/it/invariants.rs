@@ -242,6 +242,7 @@ const MODULES: [(&str, &[&str]); 5] = [
     (
         "src/train",
         &[
+            "adam",
             "exposure",
             "vignette",
             "poses",

@@ -8,6 +8,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::ExposureModel;
+use crate::adam::Step;
 use densify_core::colour::{ColourGradient, ColourTransform};
 
 /// Parameters of a transform: three rows of a matrix and an offset.
@@ -19,14 +20,6 @@ const FADE: f64 = 0.1;
 /// Step size of offsets relative to that of the matrix, because their range is smaller: exposures within a stop have
 /// offsets below 0.02.
 const OFFSET_SHARE: f64 = 0.2;
-/// Decay rate of Adam's first moment.
-const BETA1: f32 = 0.9;
-/// Decay rate of Adam's second moment. It must forget the first gradients, because a view has only a few hundred steps,
-/// not thousands like a Gaussian, and its gradients fall by orders of magnitude.
-const BETA2: f32 = 0.99;
-/// Adam's epsilon. It is smaller than every relevant gradient, such as that of a hundredth of a photograph's pixels
-/// being off by 1/255.
-const EPSILON: f32 = 1e-8;
 /// Weight of the squared differences from the identity in the loss. The rest of the loss rises by about five times the
 /// square of an error in a factor, so that the regularisation shifts a factor by less than 1/500 of its difference
 /// from 1.
@@ -115,15 +108,11 @@ impl Exposures {
         let model = self.model;
         let view = &mut self.views[view];
         view.age = view.age.saturating_add(1);
-        let age = i32::from(view.age);
-        let [first_scale, second_scale] = [BETA1, BETA2].map(|beta| 1.0 / (1.0 - beta.powi(age)));
+        let adam = Step::new(view.age.into());
         for i in (0..PARAMETERS).filter(|&i| is_learned(model, i)) {
             let share = if i < 9 { 1.0 } else { OFFSET_SHARE };
             let g = numbers[i] + 2.0 * REGULARISATION * difference[i];
-            view.first[i] = view.first[i] * BETA1 + g * (1.0 - BETA1);
-            view.second[i] = view.second[i] * BETA2 + g * g * (1.0 - BETA2);
-            let step =
-                view.first[i] * first_scale / ((view.second[i] * second_scale).sqrt() + EPSILON);
+            let step = adam.take(&mut view.first[i], &mut view.second[i], g);
             view.values[i] -= (rate * share) as f32 * step;
         }
     }

@@ -2,6 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::adam::Step;
 use densify_core::camera::Camera;
 use densify_core::vignette::{COEFFICIENTS, CORNER, PhotographPlace, Vignette, light};
 
@@ -14,12 +15,6 @@ const RATE: f64 = 0.02;
 const RATE_OF_KNOWN: f64 = 0.002;
 /// Step size at the end of a run, relative to that at the start.
 const FADE: f64 = 0.1;
-/// Decay rate of Adam's first moment.
-const BETA1: f32 = 0.9;
-/// Decay rate of Adam's second moment; as for [exposures](crate::exposure), it must forget the first gradients.
-const BETA2: f32 = 0.99;
-/// Adam's epsilon, smaller than every relevant gradient.
-const EPSILON: f32 = 1e-8;
 /// Weight of the squared terms at the corner of a square photograph in the loss. The rest of the loss rises by about a
 /// tenth of the square of an error there.
 const REGULARISATION: f32 = 1e-4;
@@ -129,18 +124,14 @@ impl Vignettes {
         };
         let rate = (rate * FADE.powf(progress.clamp(0.0, 1.0))) as f32;
         camera.age = camera.age.saturating_add(1);
-        let age = i32::try_from(camera.age).unwrap_or(i32::MAX);
-        let [first_scale, second_scale] = [BETA1, BETA2].map(|beta| 1.0 / (1.0 - beta.powi(age)));
+        let adam = Step::new(camera.age);
         let mut power = 1.0;
         for (i, gradient) in gradient.iter().enumerate() {
             power *= LARGEST;
             let moved = (camera.values[i] - camera.start[i]) * power;
             // The derivative with respect to the coefficient's term at the corner.
             let g = gradient / power + 2.0 * regularisation * moved;
-            camera.first[i] = camera.first[i] * BETA1 + g * (1.0 - BETA1);
-            camera.second[i] = camera.second[i] * BETA2 + g * g * (1.0 - BETA2);
-            let step = camera.first[i] * first_scale
-                / ((camera.second[i] * second_scale).sqrt() + EPSILON);
+            let step = adam.take(&mut camera.first[i], &mut camera.second[i], g);
             camera.values[i] -= rate * step / power;
         }
         camera.values = falling(camera.values);
