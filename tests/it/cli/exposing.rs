@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use super::{
-    call, config, copy_unfinished, files, json, model, read, resume, scratch, text, train,
+    call, config, copy_unfinished, files, json, model, read, resume, scratch, spheres, text, train,
 };
 use crate::photographs::Photographs;
 
@@ -165,12 +165,6 @@ fn undecided_auto_equals_off() {
     let fits = call(&format!("eval {} --backend cpu --fit-exposure", text(&off))).ok();
     assert!(fits.stdout.contains("fitted"), "{}", fits.stdout);
     assert!(json(&off.join("results.json"))["ours_120"]["PSNR_fitted"].is_f64());
-}
-
-/// Writes a small scene whose points have tracks.
-fn spheres(folder: &Path, options: &str) {
-    let size = "--size 64 --test 2 --points 1500 --samples 1";
-    call(&format!("scenegen --preset spheres {size} -o {} {options}", text(folder))).ok();
 }
 
 /// With `auto`, the tracks of a written scene decide whether exposures are learned, and the output says so.

@@ -113,6 +113,12 @@ fn outcome_of(mut command: Command) -> Outcome {
     Outcome { code: output.status.code(), stdout: text(output.stdout), stderr: text(output.stderr) }
 }
 
+/// Writes a small scene whose points have tracks, with these options.
+fn spheres(folder: &Path, options: &str) {
+    let size = "--size 64 --test 2 --points 1500 --samples 1";
+    call(&format!("scenegen --preset spheres {size} -o {} {options}", text(folder))).ok();
+}
+
 /// Calls the program with a different `PATH`.
 #[cfg(unix)]
 fn call_with_path(words: &str, path: &str) -> Outcome {

@@ -2,24 +2,16 @@
 
 use std::path::Path;
 
-use super::{call, config, copy_unfinished, json, model, read, resume, scratch, text, train};
+use super::{config, copy_unfinished, json, model, read, resume, scratch, spheres, text, train};
 
 const ITERATIONS: u32 = 90;
-
-fn spheres(to: &Path, flags: &str) {
-    let scene = text(to);
-    let words = format!(
-        "scenegen --preset spheres --size 48 --train 14 --test 4 --points 1500 {flags} -o {scene}"
-    );
-    call(&words).ok();
-}
 
 #[test]
 fn good_poses_stay_and_wrong_ones_are_refined() {
     let (root, whole) = scratch();
     let [good, wrong] = ["good", "wrong"].map(|name| root.path().join(name));
-    spheres(&good, "");
-    spheres(&wrong, "--pose-noise 2 --position-noise 0.02");
+    spheres(&good, "--train 14");
+    spheres(&wrong, "--train 14 --pose-noise 2 --position-noise 0.02");
     let flags = "--eval --backend cpu --budget 1700 --checkpoint-every 60";
     let fixed = root.path().join("fixed");
     train(&good, &fixed, ITERATIONS, flags).ok();
@@ -61,7 +53,7 @@ fn good_poses_stay_and_wrong_ones_are_refined() {
 fn contradictory_options_are_refused() {
     let (root, run) = scratch();
     let scene = root.path().join("scene");
-    spheres(&scene, "");
+    spheres(&scene, "--train 14");
     train(&scene, &run, 10, "--refine-focal")
         .refused("fixed poses", &["--refine-focal", "--poses refine"]);
     let frozen = root.path().join("frozen");

@@ -3,21 +3,15 @@
 use std::path::Path;
 
 use super::{
-    call, config, copy_unfinished, files, json, model, read, resume, scratch, text, train,
+    call, config, copy_unfinished, files, json, model, read, resume, scratch, spheres, text, train,
 };
 use crate::photographs::Photographs;
-
-/// Writes a small scene whose points have tracks.
-fn spheres(folder: &Path, options: &str) {
-    let size = "--size 64 --train 12 --test 2 --points 1500 --samples 1";
-    call(&format!("scenegen --preset spheres {size} -o {} {options}", text(folder))).ok();
-}
 
 #[test]
 fn vignettes_survive_resuming_and_do_not_depend_on_threads() {
     let (root, whole) = scratch();
     let scene = root.path().join("scene");
-    spheres(&scene, "--vignette 0.5 --exposure-jitter 0.5");
+    spheres(&scene, "--train 12 --vignette 0.5 --exposure-jitter 0.5");
     let flags = "--vignette on --exposure on --eval --checkpoint-every 30 --policy mcmc --backend cpu --budget 1700";
     let outcome = train(&scene, &whole, 50, &format!("{flags} --threads 1")).ok();
     for words in ["vignette on, from the colours of points", "vignettes learned: 1 camera"] {
@@ -60,7 +54,7 @@ fn auto_detects_vignettes_before_training() {
     for (strength, word) in [("0.5", "on"), ("0", "off")] {
         let [scene, run, part] =
             ["scene", "run", "part"].map(|name| root.path().join(format!("{name}{strength}")));
-        spheres(&scene, &format!("--vignette {strength}"));
+        spheres(&scene, &format!("--train 12 --vignette {strength}"));
         let flags = "--eval --backend cpu --budget 2k --checkpoint-every 0";
         let outcome = train(&scene, &run, 3, &format!("{flags} --vignette auto")).ok();
         let decision = format!("vignette {word} (auto): judged by the colours of");
