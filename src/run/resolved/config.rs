@@ -7,6 +7,7 @@ use serde::{Deserialize, Serialize};
 use toml::{Table, Value};
 
 use super::case::Init;
+use super::sources::{DegreeSource, ExposureSource, PoseSource, VignetteSource};
 use super::{ResolvedRun, ResolvedTraining};
 use crate::failure::Failure;
 use crate::spec::{
@@ -16,10 +17,6 @@ use crate::spec::{
 use densify_core::antialiasing::Antialiasing;
 use densify_core::files::{FileError, write_atomically};
 use densify_data::dataset::{DepthFinding, is_archive};
-use densify_data::track_colours::Spread;
-use densify_data::track_colours::exposures::ExposureSpread;
-use densify_data::track_colours::vignettes::VignetteSpread;
-use densify_data::track_poses::PoseErrors;
 use densify_train::output::{CONFIG_FILE, FolderError};
 
 /// A resolved run as stored in its `config.toml`.
@@ -102,71 +99,6 @@ pub struct ModelSize {
 /// True for a model without antialiasing.
 fn is_none(antialiasing: &Antialiasing) -> bool {
     !antialiasing.is_on()
-}
-
-/// The reason for learning an exposure for each photograph, or not.
-#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum ExposureSource {
-    /// The options.
-    #[default]
-    Given,
-    /// The colours of tracks, before training.
-    Tracks(ExposureSpread),
-    /// No evidence: too few tracks are known, so exposures are not learned.
-    Undecided,
-}
-
-/// The reason for refining the poses of the training views, or not.
-#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum PoseSource {
-    /// The options.
-    #[default]
-    Given,
-    /// The tracks of the reconstruction, before training.
-    Tracks(PoseErrors),
-    /// No evidence: too few tracks are known.
-    Undecided,
-}
-
-impl PoseSource {
-    fn is_given(&self) -> bool {
-        *self == Self::Given
-    }
-}
-
-/// The reason for learning a vignette for each camera, or not.
-#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum VignetteSource {
-    /// The options.
-    #[default]
-    Given,
-    /// The colours of tracks, before training, of the camera with the clearest evidence.
-    Tracks(VignetteSpread),
-    /// No evidence: too few tracks are seen at different radii, so vignettes are not learned.
-    Undecided,
-}
-
-impl VignetteSource {
-    /// True if the options decided.
-    pub fn is_given(&self) -> bool {
-        *self == Self::Given
-    }
-}
-
-/// The reason for the spherical-harmonic degree of a run.
-#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum DegreeSource {
-    /// The options.
-    #[default]
-    Given,
-    /// The colours of tracks, before training.
-    Spread(Spread),
-    /// No evidence: too few tracks are known, so the degree is the highest.
-    Undecided,
 }
 
 impl RunConfig {
@@ -342,6 +274,7 @@ fn in_shortest_decimals(mut table: Table) -> Table {
 pub(crate) mod tests {
     use super::*;
     use crate::spec::{ByteCount, PolicyFile};
+    use densify_data::track_colours::Spread;
     use densify_train::schedule::Background;
 
     #[test]

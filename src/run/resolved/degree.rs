@@ -2,8 +2,8 @@
 
 use std::ops::RangeInclusive;
 
-use super::config::DegreeSource;
 use super::inputs::Evidence;
+use super::sources::DegreeSource;
 use crate::spec::{RunSpec, ShDegree};
 use densify_core::gaussians::MAX_SH_DEGREE;
 use densify_core::numbers::grouped;

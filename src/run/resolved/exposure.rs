@@ -1,7 +1,7 @@
 //! `--exposure`: whether to learn an exposure for each photograph, and the exposures to start with.
 
-use super::config::ExposureSource;
 use super::inputs::Evidence;
+use super::sources::ExposureSource;
 use crate::failure::notes;
 use crate::spec::RunSpec;
 use densify_core::numbers::{counted, grouped};

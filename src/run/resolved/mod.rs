@@ -17,6 +17,7 @@ mod plan;
 mod poses;
 mod remedy;
 mod size;
+mod sources;
 #[cfg(test)]
 mod tests;
 mod training;
@@ -25,9 +26,7 @@ mod vignette;
 pub(crate) use case::{Case, DECODERS, Init, TEST_DECODERS};
 #[cfg(test)]
 pub(crate) use config::tests::sample;
-pub use config::{
-    DegreeSource, ExposureSource, Findings, ModelSize, PoseSource, RunConfig, VignetteSource,
-};
+pub use config::{Findings, ModelSize, RunConfig};
 pub(crate) use coordinates::random_points;
 pub use estimate::{Extent, estimate, extent};
 pub(crate) use fit::RunSize;
@@ -35,6 +34,7 @@ pub(crate) use geometry_measurement::GeometryMeasurement;
 pub(crate) use models::{importance_setup, read};
 pub use plan::{Alternatives, Plan, plan};
 pub use size::DEFAULT_BUDGET;
+pub use sources::{DegreeSource, ExposureSource, PoseSource, VignetteSource};
 pub(crate) use training::ResolvedTraining;
 
 use crate::failure::Failure;

@@ -1,7 +1,7 @@
 //! `--poses`: whether to refine the poses of the training views, and the cameras to start from.
 
-use super::config::PoseSource;
 use super::inputs::Evidence;
+use super::sources::PoseSource;
 use crate::failure::notes;
 use crate::spec::RunSpec;
 use densify_core::camera::Camera;

@@ -1,7 +1,7 @@
 //! `--vignette`: whether to learn a vignette for each camera, and the vignettes to start with.
 
-use super::config::VignetteSource;
 use super::inputs::Evidence;
+use super::sources::VignetteSource;
 use crate::failure::{Failure, OptionProblem, notes};
 use crate::spec::RunSpec;
 use densify_core::numbers::{counted, grouped};
