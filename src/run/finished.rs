@@ -18,7 +18,7 @@ use densify_core::antialiasing::Antialiasing;
 use densify_core::camera::Camera;
 use densify_core::gaussians::Gaussians;
 use densify_data::dataset::normalise::Normalisation;
-use densify_data::dataset::{Dataset, SeenDepths, View, builtin};
+use densify_data::dataset::{Dataset, SeenDepths, TrackReading, View, builtin};
 use densify_data::views::DatasetViews;
 use densify_render::{Backend, BackendError, Device, MomentStorage, Setup, Storage};
 use densify_train::evaluate::Split;
@@ -243,7 +243,7 @@ fn say_near_plane(near: NearPlane, observer: &dyn Observer) -> f32 {
 /// # Errors
 /// When the dataset cannot be read.
 pub fn load(path: &Path, data: &DataSpec, observer: &dyn Observer) -> Result<Dataset, Failure> {
-    let dataset = Dataset::load(path, &data.load_options(false))?;
+    let dataset = Dataset::load(path, &data.load_options(TrackReading::Nothing))?;
     say_notes(observer, &dataset.notes);
     Ok(dataset)
 }

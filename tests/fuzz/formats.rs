@@ -6,7 +6,7 @@
 
 use std::path::Path;
 
-use densify::data::dataset::{Dataset, LoadOptions, formats as dataset_formats};
+use densify::data::dataset::{Dataset, LoadOptions, TrackReading, formats as dataset_formats};
 use densify::data::meshes;
 use densify::data::models::{formats as model_formats, read_model};
 use densify::data::points::read_points;
@@ -119,7 +119,7 @@ fn accepts_points(path: &Path) -> bool {
 
 /// Reads the cameras of a folder or an archive, then the images.
 fn accepts_dataset(path: &Path) -> bool {
-    let options = LoadOptions { tracks: true, ..LoadOptions::default() };
+    let options = LoadOptions { tracks: TrackReading::Directions, ..LoadOptions::default() };
     let Ok(dataset) = Dataset::load(path, &options) else {
         return false;
     };

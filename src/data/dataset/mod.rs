@@ -70,7 +70,7 @@ use mask_files::MaskFile;
 pub use normalise::EXTENT;
 use normalise::Normalisation;
 pub(crate) use normalise::median;
-pub use options::{FarCameras, LoadOptions, MaskMode, Resolution, Split};
+pub use options::{FarCameras, LoadOptions, MaskMode, Resolution, Split, TrackReading};
 use paths::Root;
 pub use photograph_place::cameras_of;
 pub use seen_depths::SeenDepths;

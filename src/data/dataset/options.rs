@@ -33,10 +33,22 @@ pub struct LoadOptions {
     pub mask_mode: MaskMode,
     /// Cache folder of rendered built-in scenes; `None`: they are rendered each time.
     pub cache: Option<PathBuf>,
-    /// True to read the [`Tracks`](super::Tracks) of the reconstruction's points.
-    pub tracks: bool,
+    /// What to read of the [`Tracks`](super::Tracks) of the reconstruction's points.
+    pub tracks: TrackReading,
     /// Depth beside the photographs.
     pub depth: DepthOptions,
+}
+
+/// What to read of the tracks of the reconstruction's points.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub enum TrackReading {
+    /// Nothing.
+    #[default]
+    Nothing,
+    /// Points, and the views that show them.
+    Views,
+    /// Also where the photographs show the points, for which all observations of the reconstruction are read.
+    Directions,
 }
 
 /// Training resolution. Images are never enlarged.

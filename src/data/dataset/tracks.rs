@@ -27,7 +27,8 @@ pub struct Tracks {
     /// views.
     pub views: Vec<Vec<u32>>,
     /// Where each of these views shows the point: the direction from its camera, of unit length, in the axes of the world
-    /// by the given pose; NaN if the reconstruction does not say. Shape: as `views`.
+    /// by the given pose; NaN if the reconstruction does not say. Shape: as `views`, or empty if not
+    /// [requested](super::TrackReading).
     pub directions: Vec<Vec<[f32; 3]>>,
 }
 
@@ -44,8 +45,10 @@ impl Tracks {
     pub fn bytes(&self) -> u64 {
         let track = size_of::<DVec3>() + 3 + size_of::<Vec<u32>>();
         let views: usize = self.views.iter().map(Vec::len).sum();
-        let view = size_of::<u32>() + size_of::<[f32; 3]>();
-        (self.count() * (track + size_of::<Vec<u32>>()) + views * view) as u64
+        let known: usize = self.directions.iter().map(Vec::len).sum();
+        let lists = self.directions.len() * size_of::<Vec<[f32; 3]>>();
+        let directions = lists + known * size_of::<[f32; 3]>();
+        (self.count() * track + views * size_of::<u32>() + directions) as u64
     }
 
     /// Moves tracks to normalised coordinates and restricts them to training views. `view_of` returns the training view
@@ -57,10 +60,11 @@ impl Tracks {
     ) -> Self {
         let mut kept = Self::default();
         let points = self.positions.into_iter().zip(self.colours);
-        for ((position, colour), (views, directions)) in
-            points.zip(self.views.into_iter().zip(self.directions))
-        {
+        let has_directions = !self.directions.is_empty();
+        let mut directions = self.directions.into_iter();
+        for ((position, colour), views) in points.zip(self.views) {
             let position = normalisation.scene_from_world(position);
+            let directions = directions.next().unwrap_or_else(|| vec![UNKNOWN; views.len()]);
             let seen = views.into_iter().zip(directions);
             let seen = seen.filter_map(|(id, direction)| Some((view_of(id, position)?, direction)));
             let mut seen: Vec<(u32, [f32; 3])> = seen.collect();
@@ -71,7 +75,9 @@ impl Tracks {
                 kept.colours.push(colour);
                 let (views, directions) = seen.into_iter().unzip();
                 kept.views.push(views);
-                kept.directions.push(directions);
+                if has_directions {
+                    kept.directions.push(directions);
+                }
             }
         }
         kept
@@ -124,12 +130,17 @@ impl TrackSampler {
         }
     }
 
-    /// The tracks. `visit` passes every observation of the photographs to its argument: the photograph's id, the
+    /// The tracks without directions.
+    pub(super) fn finish(self) -> Tracks {
+        self.tracks
+    }
+
+    /// The tracks with directions. `visit` passes every observation of the photographs to its argument: the photograph's id, the
     /// observation's index in it, and the direction in the axes of the world.
     ///
     /// # Errors
     /// Those of `visit`.
-    pub(super) fn finish<E>(
+    pub(super) fn finish_with_directions<E>(
         self,
         visit: impl FnOnce(&mut dyn FnMut(u32, u32, DVec3)) -> Result<(), E>,
     ) -> Result<Tracks, E> {
@@ -178,7 +189,7 @@ mod tests {
             }
         }
         let tracks = sampler
-            .finish(|see| {
+            .finish_with_directions(|see| {
                 see(2, 8, DVec3::X);
                 see(2, 9, DVec3::Y);
                 Ok::<_, ()>(())

@@ -8,7 +8,7 @@ use super::exposures::ExposureSpread;
 use super::*;
 use crate::dataset::builtin::PREFIX;
 use crate::dataset::images::ImageSource;
-use crate::dataset::{Dataset, LoadOptions, View};
+use crate::dataset::{Dataset, LoadOptions, TrackReading, View};
 use crate::error::LoadError;
 use densify_core::camera::Camera;
 use densify_core::image::Image8;
@@ -163,7 +163,7 @@ fn no_degree_is_chosen_if_most_points_are_not_on_a_surface() {
 #[ignore = "takes minutes: run by .ci/run"]
 fn built_in_scenes_get_the_degree_that_their_materials_need() {
     for (name, degrees) in [("spheres", 0..=0), ("room", 0..=0), ("glossy", 2..=3)] {
-        let options = LoadOptions { tracks: true, ..LoadOptions::default() };
+        let options = LoadOptions { tracks: TrackReading::Views, ..LoadOptions::default() };
         let path = format!("{PREFIX}{name}");
         let loaded = Dataset::load(Path::new(&path), &options).unwrap();
         let found = measured(&loaded.tracks, &loaded.train).unwrap();

@@ -96,7 +96,8 @@ pub fn adjust(tracks: &Tracks, given: &[Camera], with_focal: bool) -> Option<Adj
     if known < MIN_TRACKS {
         return None;
     }
-    let start = State::new(tracks, given.to_vec(), sightings);
+    let seen = Seen::new(tracks, given, sightings);
+    let start = State { seen: &seen, cameras: given.to_vec(), points: tracks.positions.clone() };
     let before = start.deviation() / MEDIAN_TO_DEVIATION;
     // Either the points or the poses may be what is right, so what explains the tracks better is held fixed at first.
     let (mut by_poses, mut by_points) = (start.clone(), start);
@@ -150,11 +151,8 @@ struct Eliminated {
     focal: [f64; 2],
 }
 
-/// The adjustment in progress.
-#[derive(Clone)]
-struct State {
-    cameras: Vec<Camera>,
-    points: Vec<DVec3>,
+/// What the adjustment does not change.
+struct Seen {
     /// By track.
     sightings: Vec<Sighting>,
     /// Indices of the sightings of each view.
@@ -165,9 +163,9 @@ struct State {
     lens: Vec<usize>,
 }
 
-impl State {
-    fn new(tracks: &Tracks, cameras: Vec<Camera>, sightings: Vec<Sighting>) -> Self {
-        let mut of_view = vec![Vec::new(); cameras.len()];
+impl Seen {
+    fn new(tracks: &Tracks, given: &[Camera], sightings: Vec<Sighting>) -> Self {
+        let mut of_view = vec![Vec::new(); given.len()];
         let mut of_track = vec![0..0; tracks.count()];
         for (i, sighting) in sightings.iter().enumerate() {
             of_view[sighting.view as usize].push(i as u32);
@@ -179,12 +177,35 @@ impl State {
             (camera.width, camera.height, lengths)
         };
         let mut first = HashMap::new();
-        let numbered = cameras.iter().enumerate();
+        let numbered = given.iter().enumerate();
         let lens =
             numbered.map(|(view, camera)| *first.entry(key(camera)).or_insert(view)).collect();
-        Self { cameras, points: tracks.positions.clone(), sightings, of_view, of_track, lens }
+        Self { sightings, of_view, of_track, lens }
     }
+}
 
+/// Peak memory of an adjustment by these tracks, in addition to them `[bytes]`.
+pub fn bytes(tracks: &Tracks) -> u64 {
+    let sightings: usize = tracks.directions.iter().map(Vec::len).sum();
+    // Each with its index, in a list that may have grown to twice its size.
+    let of_sightings = sightings * (size_of::<Sighting>() + 2 * size_of::<u32>());
+    // Distances are sorted to find their median.
+    let medians = sightings * size_of::<f64>();
+    // Two states with their next points, and the pairs by which the world is restored.
+    let of_points = tracks.count() * 5 * size_of::<DVec3>();
+    let ranges = tracks.count() * size_of::<std::ops::Range<usize>>();
+    (of_sightings + medians + of_points + ranges) as u64
+}
+
+/// The adjustment in progress.
+#[derive(Clone)]
+struct State<'a> {
+    seen: &'a Seen,
+    cameras: Vec<Camera>,
+    points: Vec<DVec3>,
+}
+
+impl State<'_> {
     /// The projection of a sighting's point less its pixel, and the point in camera coordinates; `None` behind the camera.
     fn residual(&self, sighting: &Sighting) -> Option<(DVec2, DVec3)> {
         let camera = &self.cameras[sighting.view as usize];
@@ -195,7 +216,7 @@ impl State {
 
     /// Robust standard deviation of the residuals along an axis `[px]`.
     fn deviation(&self) -> f64 {
-        let lengths = self.sightings.iter().filter_map(|s| Some(self.residual(s)?.0.length()));
+        let lengths = self.seen.sightings.iter().filter_map(|s| Some(self.residual(s)?.0.length()));
         let median = median(lengths.collect()).unwrap_or(0.0);
         MEDIAN_TO_DEVIATION * median
     }
@@ -212,12 +233,12 @@ impl State {
             let mut of_lens = vec![[0.0; 2]; this.cameras.len()];
             for (view, eliminated) in equations.iter().enumerate() {
                 if let Some(Eliminated { focal, .. }) = eliminated {
-                    let lens = this.lens[view];
+                    let lens = this.seen.lens[view];
                     of_lens[lens] = [of_lens[lens][0] + focal[0], of_lens[lens][1] + focal[1]];
                 }
             }
             for (view, log_focal) in log_focal.iter_mut().enumerate() {
-                let [square, right] = of_lens[this.lens[view]];
+                let [square, right] = of_lens[this.seen.lens[view]];
                 *log_focal = if square > 0.0 { (right / square).clamp(-0.1, 0.1) } else { 0.0 };
             }
         }
@@ -242,8 +263,10 @@ impl State {
         let camera = self.cameras[view];
         let mut equations = NormalEquations::<7>::default();
         let mut count = 0;
-        for &i in &self.of_view[view] {
-            let Some((residual, p)) = self.residual(&self.sightings[i as usize]) else { continue };
+        for &i in &self.seen.of_view[view] {
+            let Some((residual, p)) = self.residual(&self.seen.sightings[i as usize]) else {
+                continue;
+            };
             count += 1;
             let weight = huber(residual, deviation);
             let by_focal = [camera.fx * p.x / p.z, camera.fy * p.y / p.z];
@@ -271,8 +294,8 @@ impl State {
 
     /// Root mean square over a view's points of the distance between their projections by two cameras `[px]`.
     fn motion(&self, view: usize, from: &Camera, to: &Camera) -> f64 {
-        let squares = self.of_view[view].iter().filter_map(|&i| {
-            let point = self.points[self.sightings[i as usize].track as usize];
+        let squares = self.seen.of_view[view].iter().filter_map(|&i| {
+            let point = self.points[self.seen.sightings[i as usize].track as usize];
             let [(a, z0), (b, z1)] = [from, to].map(|camera| camera.project(point));
             (z0 > 0.0 && z1 > 0.0).then(|| a.distance_squared(b))
         });
@@ -285,7 +308,7 @@ impl State {
         let this = &*self;
         let step = |track: usize| {
             let point = this.points[track];
-            let seen = &this.sightings[this.of_track[track].clone()];
+            let seen = &this.seen.sightings[this.seen.of_track[track].clone()];
             let mut equations = NormalEquations::<3>::default();
             let mut first: Option<DVec3> = None;
             let mut is_known = false;
@@ -317,7 +340,7 @@ impl State {
         self.move_by(&Similarity::between_cameras(&cameras));
         let moved = self.cameras.iter().zip(given).map(|(a, b)| a.centre().distance(b.centre()));
         let of_cameras = median(moved.collect()).unwrap_or(0.0) / (given.len() as f64).sqrt();
-        let seen = |track: &usize| self.of_track[*track].len() > 1;
+        let seen = |track: &usize| self.seen.of_track[*track].len() > 1;
         let mut pairs: Vec<[DVec3; 2]> = (0..positions.len())
             .filter(seen)
             .map(|track| [self.points[track], positions[track]])
@@ -349,7 +372,7 @@ impl State {
         let deviation = self.deviation();
         let (mut views, mut motion, mut noise) = (0, 0.0, 0.0);
         for (view, given) in given.iter().enumerate() {
-            let count = self.of_view[view].len();
+            let count = self.seen.of_view[view].len();
             if count >= MIN_POINTS {
                 views += 1;
                 motion += self.motion(view, given, &self.cameras[view]).powi(2);
@@ -359,7 +382,7 @@ impl State {
         }
         let mean = |sum: f64| (sum / f64::from(views).max(1.0)).sqrt();
         PoseErrors {
-            tracks: self.of_track.iter().filter(|seen| seen.len() > 1).count(),
+            tracks: self.seen.of_track.iter().filter(|seen| seen.len() > 1).count(),
             views: views as usize,
             before,
             after: deviation / MEDIAN_TO_DEVIATION,

@@ -104,10 +104,10 @@ impl<'a> Case<'a> {
         let may_refine = spec.schedule.poses != PoseChoice::Fixed;
         let may_learn_vignettes = spec.schedule.vignette != VignetteChoice::Off;
         let reading = Reading {
-            tracks: spec.size.sh_degree == Some(ShDegree::Auto(None))
+            by_colours: spec.size.sh_degree == Some(ShDegree::Auto(None))
                 || may_learn_exposures
-                || may_learn_vignettes
-                || may_refine,
+                || may_learn_vignettes,
+            by_directions: may_refine,
             colours: true,
             exif: may_learn_exposures,
             vignettes: may_learn_vignettes,
@@ -135,7 +135,8 @@ impl<'a> Case<'a> {
         let reading = Reading {
             // A checkpoint contains the rows of both models, so their files may no longer exist.
             models: Some([findings.init_model, findings.frozen]),
-            tracks: decides_exposures || decides_vignettes || decides_poses,
+            by_colours: decides_exposures || decides_vignettes,
+            by_directions: decides_poses,
             colours: true,
             exif: decides_exposures,
             vignettes: decides_vignettes,
@@ -173,7 +174,8 @@ impl<'a> Case<'a> {
         let refines_poses = spec.schedule.poses != PoseChoice::Fixed;
         let reading = Reading {
             models: Some(models),
-            tracks: has_exposures || has_vignettes || refines_poses,
+            by_colours: has_exposures || has_vignettes,
+            by_directions: refines_poses,
             vignettes: has_vignettes,
             ..Reading::default()
         };

@@ -7,9 +7,10 @@ use crate::observer::{Observer, say_notes};
 use crate::spec::knobs::Knobs;
 use crate::spec::{AbsolutePath, InitChoice, RunSpec, StartSpec};
 use densify_data::dataset::images::ImageDemand;
-use densify_data::dataset::{Dataset, ReportedExposures, Tracks, View};
+use densify_data::dataset::{Dataset, ReportedExposures, TrackReading, Tracks, View};
 use densify_data::track_colours::vignettes;
 use densify_data::track_colours::{self, MIN_TRACKS, TrackColours};
+use densify_data::track_poses;
 use densify_render::{Accumulation, BackendKind, Device};
 use densify_train::init::usable_points;
 
@@ -60,9 +61,11 @@ pub(super) struct Evidence {
 pub(super) struct Reading {
     /// Sizes of the models of `--init` and `--freeze`; `None`: their files are read.
     pub(super) models: Option<[Option<ModelSize>; 2]>,
-    /// Read the tracks of the reconstruction.
-    pub(super) tracks: bool,
-    /// Read the colours of the tracks.
+    /// Something is decided by the colours of the tracks.
+    pub(super) by_colours: bool,
+    /// Something is decided by where photographs show the points of the tracks.
+    pub(super) by_directions: bool,
+    /// Read the colours of the tracks, if something is decided by them; otherwise only their memory is counted.
     pub(super) colours: bool,
     /// Read the exposures in EXIF.
     pub(super) exif: bool,
@@ -75,6 +78,17 @@ pub(super) struct Reading {
     pub(super) tolerance: u64,
 }
 
+impl Reading {
+    /// What to read of the tracks of the reconstruction.
+    fn tracks(&self) -> TrackReading {
+        match (self.by_directions, self.by_colours) {
+            (true, _) => TrackReading::Directions,
+            (false, true) => TrackReading::Views,
+            (false, false) => TrackReading::Nothing,
+        }
+    }
+}
+
 impl Inputs {
     /// Loads the dataset, and the evidence that `reading` names.
     pub(super) fn open(
@@ -85,7 +99,8 @@ impl Inputs {
     ) -> Result<(Self, Evidence), Failure> {
         let observer = host.observer;
         let scene = spec.scene()?;
-        let mut dataset = Dataset::load(scene, &spec.load_options(reading.tracks, reading.depth))?;
+        let mut dataset =
+            Dataset::load(scene, &spec.load_options(reading.tracks(), reading.depth))?;
         say_notes(observer, &dataset.notes);
         observer.say(format_args!("scene    {}: {}", scene.display(), dataset.describe()));
         if let Some(depth) = &dataset.depth {
@@ -107,11 +122,16 @@ impl Inputs {
         let resident = (host.process.resident)().map(|now| now.saturating_sub(uncounted));
         let peak = (host.process.peak)();
         let tracks = std::mem::take(&mut dataset.tracks);
-        let has_colours = reading.colours && tracks.count() >= MIN_TRACKS;
+        let has_colours = reading.by_colours && reading.colours && tracks.count() >= MIN_TRACKS;
         let mut colours =
             has_colours.then(|| TrackColours::read(&tracks, &dataset.train)).transpose()?;
-        let mut track_bytes =
-            if reading.tracks { tracks.bytes() + track_colours::bytes(&tracks) } else { 0 };
+        let mut track_bytes = tracks.bytes();
+        if reading.by_colours {
+            track_bytes += track_colours::bytes(&tracks);
+        }
+        if reading.by_directions {
+            track_bytes += track_poses::bytes(&tracks);
+        }
         let mut of_vignettes = VignetteEvidence::default();
         if reading.vignettes {
             track_bytes += vignettes::bytes(&tracks);
@@ -140,7 +160,7 @@ impl Inputs {
     pub(super) fn at_resolution_of(&self, spec: &RunSpec) -> Result<Self, Failure> {
         let dataset = Dataset::load(
             spec.scene()?,
-            &spec.load_options(false, Some(self.dataset.depth.is_some())),
+            &spec.load_options(TrackReading::Nothing, Some(self.dataset.depth.is_some())),
         )?;
         Ok(Self { images: image_demand(&dataset), dataset, ..self.clone() })
     }

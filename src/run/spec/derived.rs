@@ -11,13 +11,13 @@ use super::knobs::Knobs;
 use super::values;
 use super::{DataSpec, DepthSpec, InitChoice, RunSpec};
 use crate::failure::{Failure, OptionProblem};
-use densify_data::dataset::{DepthChoice, DepthOptions, LoadOptions, Split, builtin};
+use densify_data::dataset::{DepthChoice, DepthOptions, LoadOptions, Split, TrackReading, builtin};
 use densify_train::schedule::{InitRates, RateOptions};
 use densify_train::trainer::DepthTraining;
 
 impl DataSpec {
-    /// The options for reading the dataset, with or without tracks.
-    pub fn load_options(&self, tracks: bool) -> LoadOptions {
+    /// The options for reading the dataset.
+    pub fn load_options(&self, tracks: TrackReading) -> LoadOptions {
         LoadOptions {
             images: self.images.clone(),
             sparse: self.sparse.clone(),
@@ -55,9 +55,9 @@ impl DepthSpec {
 }
 
 impl RunSpec {
-    /// The options for reading the dataset with its depth, with or without tracks. `is_known` is the decision about
-    /// depth that an earlier session of the run has taken.
-    pub(crate) fn load_options(&self, tracks: bool, is_known: Option<bool>) -> LoadOptions {
+    /// The options for reading the dataset with its depth. `is_known` is the decision about depth that an earlier
+    /// session of the run has taken.
+    pub(crate) fn load_options(&self, tracks: TrackReading, is_known: Option<bool>) -> LoadOptions {
         let DepthSpec { depth, depth_unit, depth_along, depth_points, .. } = &self.depth;
         // A cloud that is named is meant to be used.
         let wanted = match depth.unwrap_or(DepthChoice::Auto) {
@@ -233,7 +233,7 @@ mod tests {
         let options = |lines: &str, is_known| {
             let file: Table = lines.parse().unwrap();
             let spec = Partial::new(file, "file.toml").unwrap().describe().unwrap();
-            spec.load_options(false, is_known).depth
+            spec.load_options(TrackReading::Nothing, is_known).depth
         };
         let cloud = "depth_points = \"/cloud.ply\"";
         for (depth, choice) in [

@@ -19,7 +19,7 @@ use densify_core::files::{FileError, folder_of, write_atomically};
 use densify_core::gaussians::{MAX_SH_DEGREE, sh_coefficients};
 use densify_core::memory::Bytes;
 use densify_core::numbers::grouped;
-use densify_data::dataset::{Dataset, builtin, view_line};
+use densify_data::dataset::{Dataset, TrackReading, builtin, view_line};
 use densify_data::models::Coordinates;
 use densify_run::failure::Failure;
 use densify_run::{
@@ -150,7 +150,7 @@ impl<'a> Planner<'a> {
             Some(_) => options.scene.clone(),
             None => std::path::absolute(&options.scene).map_err(Failure::input)?,
         };
-        let dataset = Dataset::load(&scene, &spec.data.load_options(true))?;
+        let dataset = Dataset::load(&scene, &spec.data.load_options(TrackReading::Views))?;
         say_notes(observer, &dataset.notes);
         let normalisation = &dataset.normalisation;
         let cameras: Vec<Camera> = dataset

@@ -12,7 +12,7 @@ use super::{
 use densify_core::camera::Camera;
 use densify_core::files::{FileError, write_atomically};
 use densify_core::numbers::gaussians;
-use densify_data::dataset::Dataset;
+use densify_data::dataset::{Dataset, TrackReading};
 use densify_data::models::PLY;
 use densify_launch::utf8;
 use densify_run::failure::Failure;
@@ -141,7 +141,7 @@ fn prepare_block(
 /// The cameras of a block's training views, in world coordinates.
 fn world_cameras(plan: &BlockPlan, options: Partial) -> Result<Vec<Camera>, Failure> {
     let spec = options.describe()?;
-    let dataset = Dataset::load(&plan.scene, &spec.data.load_options(false))?;
+    let dataset = Dataset::load(&plan.scene, &spec.data.load_options(TrackReading::Nothing))?;
     let to_world = &dataset.normalisation;
     Ok(dataset.train.iter().map(|view| to_world.world_from_scene_camera(&view.camera)).collect())
 }

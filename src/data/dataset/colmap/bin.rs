@@ -246,6 +246,37 @@ pub(super) fn points(
 mod tests {
     use super::*;
 
+    #[test]
+    fn observations_are_those_of_the_text_format() {
+        let folder = tempfile::tempdir().unwrap();
+        let [binary, text] = ["images.bin", "images.txt"].map(|name| folder.path().join(name));
+        let mut bytes = 2u64.to_le_bytes().to_vec();
+        for (id, name) in [(7u32, "a.png"), (9, "b.png")] {
+            bytes.extend(id.to_le_bytes());
+            bytes.extend(
+                [1.0, 0.0, 0.0, 0.0, 0.5, 0.25, 4.0].iter().flat_map(|v: &f64| v.to_le_bytes()),
+            );
+            bytes.extend(1u32.to_le_bytes());
+            bytes.extend(name.bytes().chain([0]));
+            bytes.extend(2u64.to_le_bytes());
+            for place in [1.5, f64::from(id)] {
+                bytes.extend([place, 2.5].iter().flat_map(|v: &f64| v.to_le_bytes()));
+                bytes.extend([0xff; 8]);
+            }
+        }
+        std::fs::write(&binary, bytes).unwrap();
+        let image = |id: u32, name: &str| {
+            format!("{id} 1 0 0 0 0.5 0.25 4 1 {name}\n1.5 2.5 -1 {id} 2.5 -1\n")
+        };
+        std::fs::write(&text, image(7, "a.png") + &image(9, "b.png")).unwrap();
+        let [mut of_binary, mut of_text] = [Vec::new(), Vec::new()];
+        observations(&binary, &mut |id, at, pixel| of_binary.push((id, at, pixel))).unwrap();
+        let see = &mut |id, at, pixel| of_text.push((id, at, pixel));
+        super::super::txt::observations(&text, see).unwrap();
+        assert_eq!(of_binary, of_text);
+        assert_eq!(of_binary[3], (9, 1, DVec2::new(9.0, 2.5)));
+    }
+
     /// A file of 100 bytes cannot hold 13 records of 8 bytes, and 12 may be more than are supported.
     #[test]
     fn impossible_counts_state_the_limit_that_they_exceed() {

@@ -23,7 +23,8 @@ use super::pose::{checked_pose, checked_quaternion};
 use super::prepare::text_notes;
 use super::tracks::{TrackSampler, Tracks};
 use super::{
-    Frame, LoadError, LoadOptions, LoadRemedy, Note, PointCloud, Scene, Split, transforms,
+    Frame, LoadError, LoadOptions, LoadRemedy, Note, PointCloud, Scene, Split, TrackReading,
+    transforms,
 };
 
 pub(super) const FORMAT: DatasetFormat = DatasetFormat {
@@ -260,11 +261,11 @@ fn read(root: &Root, options: &LoadOptions) -> Result<Option<Scene>, LoadError> 
 /// The paths and contents of a model's three files. The points file may be missing.
 fn model(
     ChosenModel { folder, root, .. }: &ChosenModel,
-    with_tracks: bool,
+    reading: TrackReading,
 ) -> Result<([PathBuf; 3], Model), LoadError> {
     let path = |name: &str| file(root, folder, name);
     let (cameras, images, points) = (path("cameras")?, path("images")?, path("points3D")?);
-    let mut sampler = with_tracks.then(TrackSampler::new);
+    let mut sampler = (reading != TrackReading::Nothing).then(TrackSampler::new);
     let tracks = sampler.as_mut();
     let lenses = if is_binary(&cameras) { bin::cameras } else { txt::cameras }(&cameras)?;
     let posed = if is_binary(&images) { bin::images } else { txt::images }(&images)?;
@@ -273,30 +274,41 @@ fn model(
         true if is_binary(&points) => bin::points(&points, tracks)?,
         true => txt::points(&points, tracks)?,
     };
-    let by_id: HashMap<u32, &Image> = posed.iter().map(|image| (image.id, image)).collect();
-    let read = if is_binary(&images) { bin::observations } else { txt::observations };
-    let tracks = sampler.map_or(Ok(Tracks::default()), |sampler| {
-        sampler.finish(|see| {
-            read(&images, &mut |id, observation, pixel| {
-                let image = by_id.get(&id);
-                let lens = image.and_then(|image| lenses.get(&image.camera));
-                let local = lens.and_then(|lens| lens.unproject(pixel).ok());
-                if let Some((image, local)) = image.zip(local) {
-                    let world = image.rotation.transpose() * local.normalize();
-                    see(id, observation, world);
-                }
-            })
-        })
-    })?;
+    let tracks = match sampler {
+        None => Tracks::default(),
+        Some(sampler) if reading == TrackReading::Views => sampler.finish(),
+        Some(sampler) => with_directions(sampler, &images, &posed, &lenses)?,
+    };
     Ok(([cameras, images, points], Model { cameras: lenses, images: posed, points: cloud, tracks }))
+}
+
+/// The tracks with the directions in which the photographs show their points.
+fn with_directions(
+    sampler: TrackSampler,
+    images: &Path,
+    posed: &[Image],
+    lenses: &HashMap<u32, Lens>,
+) -> Result<Tracks, LoadError> {
+    let by_id: HashMap<u32, &Image> = posed.iter().map(|image| (image.id, image)).collect();
+    let read = if is_binary(images) { bin::observations } else { txt::observations };
+    sampler.finish_with_directions(|see| {
+        read(images, &mut |id, observation, pixel| {
+            let image = by_id.get(&id);
+            let lens = image.and_then(|image| lenses.get(&image.camera));
+            let local = lens.and_then(|lens| lens.unproject(pixel).ok());
+            if let Some((image, local)) = image.zip(local) {
+                see(id, observation, image.rotation.transpose() * local.normalize());
+            }
+        })
+    })
 }
 
 /// Adds the tracks of the COLMAP model in a folder to a scene of another format, if the images listed in both formats
 /// have the same poses, as in datasets that `densify scenegen` writes. Otherwise the model is ignored, as it may belong
 /// to another scene.
-pub(super) fn adopt_tracks(root: &Root, scene: &mut Scene) {
+pub(super) fn adopt_tracks(root: &Root, scene: &mut Scene, reading: TrackReading) {
     let Ok(Some(chosen)) = choose_model(root, None) else { return };
-    let Ok((_, model)) = model(&chosen, true) else { return };
+    let Ok((_, model)) = model(&chosen, reading) else { return };
     let by_name: HashMap<String, &Image> =
         model.images.iter().map(|image| (relative(&image.name), image)).collect();
     let mut matched = false;

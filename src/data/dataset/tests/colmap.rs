@@ -85,7 +85,7 @@ fn a_model_may_have_no_points() {
         for extension in ["txt", "bin"] {
             let _ = fs::remove_file(made.file(&format!("sparse/0/points3D.{extension}")));
         }
-        let tracks = LoadOptions { tracks: true, ..LoadOptions::default() };
+        let tracks = LoadOptions { tracks: TrackReading::Directions, ..LoadOptions::default() };
         let data = load_with(&made, &tracks);
         assert_eq!((data.train.len(), data.points.len()), (3, 0));
         assert_noted(&data, "points3D, does not exist");

@@ -69,7 +69,8 @@ fn views_of_one_photograph_share_its_file_and_split() {
     // The field of view is 191 by 115 degrees.
     let made = colmap("OPENCV_FISHEYE 20 12 6 6 10 6 0 0 0 0");
     let every = Split::Every(std::num::NonZeroU32::new(2).unwrap());
-    let options = LoadOptions { split: every, tracks: true, ..LoadOptions::default() };
+    let options =
+        LoadOptions { split: every, tracks: TrackReading::Directions, ..LoadOptions::default() };
     let data = load_with(&made, &options);
     let faces = |name: &str| {
         let stem = name.trim_end_matches(".png");
@@ -115,7 +116,10 @@ fn a_track_is_in_the_view_that_shows_its_point() {
     made.write("sparse/0/images.txt", images + "4 1 0 0 0 0.1 0 4 1 d.png\n1 1 -1\n");
     let points = std::fs::read_to_string(made.file("sparse/0/points3D.txt")).unwrap();
     made.write("sparse/0/points3D.txt", points.replace(" 0.1 1 2\n", " 0.1 1 0 2 0 3 0 4 0\n"));
-    let data = load_with(&made, &LoadOptions { tracks: true, ..LoadOptions::default() });
+    let data = load_with(
+        &made,
+        &LoadOptions { tracks: TrackReading::Directions, ..LoadOptions::default() },
+    );
     assert!(data.tracks.positions.len() >= 10, "{}", data.tracks.positions.len());
     for (point, views) in data.tracks.positions.iter().zip(&data.tracks.views) {
         for &view in views {

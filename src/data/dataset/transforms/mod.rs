@@ -24,7 +24,7 @@ use super::json;
 use super::mask_files::Listed;
 use super::paths::{DataPath, Root, existing_namesake, relative};
 use super::prepare::text_notes;
-use super::{Frame, LoadError, LoadOptions, Note, Scene, Split, colmap};
+use super::{Frame, LoadError, LoadOptions, Note, Scene, Split, TrackReading, colmap};
 use fields::Fields;
 use named_files::points_file;
 pub(super) use named_files::usual_points;
@@ -64,8 +64,8 @@ fn read_pair(root: &Root, options: &LoadOptions) -> Result<Option<Scene>, LoadEr
     scene.frames.extend(test.frames);
     scene.notes.extend(test.notes);
     scene.own_split = true;
-    if options.tracks {
-        colmap::adopt_tracks(root, &mut scene);
+    if options.tracks != TrackReading::Nothing {
+        colmap::adopt_tracks(root, &mut scene, options.tracks);
     }
     Ok(Some(scene))
 }

@@ -16,7 +16,7 @@ use crate::dataset::images::ImageSource;
 use crate::dataset::photographs::{Photograph, target_size};
 use crate::dataset::prepare::{assemble, text_notes};
 use crate::dataset::tracks::TrackSampler;
-use crate::dataset::{self, Dataset, LoadError, LoadOptions, PointCloud, View};
+use crate::dataset::{self, Dataset, LoadError, LoadOptions, PointCloud, TrackReading, View};
 use densify_core::camera::Camera;
 use densify_core::image::Image8;
 use scene_cache::Entry;
@@ -159,21 +159,25 @@ fn dataset(
     let mut found_at = Vec::new();
     let coloured = points.positions.iter().zip(&points.colours).zip(&points.found_at);
     for (((&position, &colour), &at), seen_by) in coloured.zip(&points.seen_by) {
-        if options.tracks && sampler.wants(seen_by.len() as u64) {
+        if options.tracks != TrackReading::Nothing && sampler.wants(seen_by.len() as u64) {
             let number = found_at.len() as u32;
             sampler.add(position, colour, seen_by.iter().map(|&view| (view, number)));
             found_at.push((at, seen_by));
         }
     }
-    let tracks = sampler.finish(|see| {
-        for (number, (at, seen_by)) in (0..).zip(&found_at) {
-            for &view in *seen_by {
-                let centre = summary.views[view as usize].camera.centre;
-                see(view, number, (*at - centre).normalize());
+    let tracks = if options.tracks == TrackReading::Directions {
+        sampler.finish_with_directions(|see| {
+            for (number, (at, seen_by)) in (0..).zip(&found_at) {
+                for &view in *seen_by {
+                    let centre = summary.views[view as usize].camera.centre;
+                    see(view, number, (*at - centre).normalize());
+                }
             }
-        }
-        Ok::<_, LoadError>(())
-    })?;
+            Ok::<_, LoadError>(())
+        })?
+    } else {
+        sampler.finish()
+    };
     let read = dataset::Scene {
         points: PointCloud { positions: points.positions, colours: points.colours },
         tracks,
