@@ -1,5 +1,5 @@
 use densify_core::pose::Twist;
-use glam::DMat3;
+use glam::{DMat3, DVec2, DVec3};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
