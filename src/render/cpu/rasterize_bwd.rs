@@ -9,7 +9,8 @@
 //! A batch of splats is walked twice. The first walk goes front to back, one patch at a time as in the forward
 //! pass. It computes each alpha, its weight as if nothing were in front of the batch, and the product of all 1 − α;
 //! the transmittance behind the batch, divided by this product, is that in front of the batch. The second walk goes
-//! back to front, one splat at a time, and computes the gradients, whose sums then stay in registers.
+//! back to front, one splat at a time, and computes the gradients, whose sums then stay in registers; where there are few
+//! registers, the sums of moments get a walk of their own.
 //!
 //! In the whitened coordinates (u, z) = Lᵀ·d of the forward pass, the parameters' gradients need only the sums, over
 //! the pixels of a tile, of q, q·u, q·z, q·u², q·u·z, q·z² with q = α·dL/dα, and of w·g for the colour. The
@@ -35,9 +36,9 @@ use super::rasterize::{
     ALPHA_MAX, Aligned, Blending, PATCHES, Plane, TRANSMITTANCE, TileCanvas, TilePlace, ZERO_PLANE,
 };
 use super::records::{TileRecords, write};
-use super::simd::{V, WIDTH, each, sums_of_four};
+use super::simd::{V, WIDTH, each, exp2_of, sums_of_four};
 use super::tiles::Entry;
-use crate::signals::{BASE, Field, RecordLayout};
+use crate::signals::{Field, RecordLayout};
 
 /// Indices of the values that every record has.
 pub(super) mod field {
@@ -166,10 +167,9 @@ pub(super) struct BlendedBatch {
     weight: [[f32; WIDTH]; PAIRS],
 }
 
-/// Sums of one entry, lane by lane.
-struct Sums<S: Simd> {
-    base: [V<S>; BASE],
-    abs: [V<S>; 2],
+/// Sums of one entry over the pixels, lane by lane, that the colours of the pixels lead to.
+struct ColourSums<S: Simd> {
+    colour: [V<S>; 3],
     weight: V<S>,
     pixels: V<S>,
     /// Weights times the error of the pixel.
@@ -179,11 +179,41 @@ struct Sums<S: Simd> {
     weight_max: V<S>,
 }
 
+/// Sums of one entry over the pixels, lane by lane, that its place and shape lead to.
+struct Moments<S: Simd> {
+    /// Sums of q, q·u, q·z, q·u², q·u·z, q·z².
+    q: [V<S>; field::COLOUR],
+    abs: [V<S>; 2],
+}
+
+impl<S: Simd> Moments<S> {
+    /// Adds the pixels with these values of q, u and z. `y2_u` and `l3` are the derivatives of u and z with respect to
+    /// the pixel's row.
+    #[inline(always)]
+    fn add<const EXTRAS: u8>(&mut self, q: V<S>, [u, z]: [V<S>; 2], y2_u: V<S>, l3: f32) {
+        let qu = q * u;
+        let qz = q * z;
+        let sums = &mut self.q;
+        sums[field::Q] = sums[field::Q] + q;
+        sums[field::U] = sums[field::U] + qu;
+        sums[field::Z] = sums[field::Z] + qz;
+        sums[field::UU] = qu.mul_add(u, sums[field::UU]);
+        sums[field::UZ] = qu.mul_add(z, sums[field::UZ]);
+        sums[field::ZZ] = qz.mul_add(z, sums[field::ZZ]);
+        if EXTRAS & extra::ABS != 0 {
+            self.abs[0] = self.abs[0] + qu.abs();
+            let y2 = y2_u.mul_add(qu, qz * l3);
+            self.abs[1] = self.abs[1] + y2.abs();
+        }
+    }
+}
+
 impl BlendedBatch {
     /// The first walk over a batch, whose first splat is entry `first` of the list. Changes `transmittance` from the
-    /// transmittance behind the batch to the one in front. Returns the end of each patch's pairs.
+    /// transmittance behind the batch to the one in front. Returns the end of each patch's pairs. `N` vectors of a patch
+    /// are computed at a time.
     #[inline(always)]
-    fn fill<S: Simd>(
+    fn fill<S: Simd, const N: usize>(
         &mut self,
         s: S,
         batch: &Batch,
@@ -202,28 +232,38 @@ impl BlendedBatch {
             if reached == 0 {
                 continue;
             }
-            for at in (0..WIDTH).step_by(S::F32_LANES) {
-                let stop = S::as_simd_u32s(&canvas.stop[p][at..]).0[0];
-                let mut product = c(1.0);
+            for at in (0..WIDTH).step_by(N * S::F32_LANES) {
+                let mut product = [c(1.0); N];
                 let (mut pair, mut todo) = (start, reached);
                 while todo != 0 {
                     // The mask has 32 bits; the remainder removes the bounds check of every load.
                     let i = todo.trailing_zeros() as usize % BATCH;
                     todo &= todo - 1;
-                    let [u, z] = batch.u_and_z(s, i, p, at);
                     let log2_opacity = c(batch.splats[i].log2_opacity);
-                    let e = u.neg_mul_add(u, z.neg_mul_add(z, log2_opacity));
+                    let mut e = product;
+                    for (n, e) in e.iter_mut().enumerate() {
+                        let [u, z] = batch.u_and_z(s, i, p, at + n * S::F32_LANES);
+                        *e = u.neg_mul_add(u, z.neg_mul_add(z, log2_opacity));
+                    }
+                    let power = exp2_of(e);
                     let here = s.splat_u32s((first + i) as u32);
-                    let seen = e_min.le(e).and(super::simd::before(s, here, stop));
-                    let alpha = seen.keep(e.exp2().min(c(ALPHA_MAX)));
-                    alpha.store(&mut alphas[pair % PAIRS][at..]);
-                    (alpha * product).store(&mut weights[pair % PAIRS][at..]);
-                    product = alpha.neg_mul_add(product, product);
+                    for n in 0..N {
+                        let at = at + n * S::F32_LANES;
+                        let stop = S::as_simd_u32s(&canvas.stop[p][at..]).0[0];
+                        let seen = e_min.le(e[n]).and(super::simd::before(s, here, stop));
+                        let alpha = seen.keep(power[n].min(c(ALPHA_MAX)));
+                        alpha.store(&mut alphas[pair % PAIRS][at..]);
+                        (alpha * product[n]).store(&mut weights[pair % PAIRS][at..]);
+                        product[n] = alpha.neg_mul_add(product[n], product[n]);
+                    }
                     pair += 1;
                 }
-                // Where the product underflows, the transmittance behind has underflowed too.
-                let t = V::load(s, &transmittance[p][at..]) / product.max(c(f32::MIN_POSITIVE));
-                t.store(&mut transmittance[p][at..]);
+                for (n, product) in product.into_iter().enumerate() {
+                    // Where the product underflows, the transmittance behind has underflowed too.
+                    let behind = &mut transmittance[p][at + n * S::F32_LANES..];
+                    let t = V::load(s, behind) / product.max(c(f32::MIN_POSITIVE));
+                    t.store(behind);
+                }
             }
             start += reached.count_ones() as usize;
             ends[p] = start;
@@ -239,6 +279,9 @@ impl RasterizeBwd<'_> {
         let Self { splats, list, place, background, blending, canvas, upstream, layout, .. } = self;
         let Self { records, batch, blended, depth, .. } = self;
         let c = |x: f32| V::splat(s, x);
+        // The sixteen registers of AVX2 do not hold all sums of an entry, so they are added up in two walks over its
+        // patches.
+        let one_walk = const { S::F32_LANES != 8 };
         let [gr, gg, gb, by_depth, errors] = &upstream.planes;
         let [centre, square, by_alpha] =
             [CENTRE, SQUARE, BY_ALPHA].map(|plane| &canvas.planes[plane]);
@@ -274,16 +317,21 @@ impl RasterizeBwd<'_> {
             for (p, &end) in patch_end.iter().enumerate() {
                 batch.cut(p, (end as usize).saturating_sub(first));
             }
-            let mut ends = blended.fill(s, batch, first, blending, canvas, transmittance);
+            // Halves or quarters of a patch are computed in pairs, so that constants are loaded once.
+            let mut ends = if const { matches!(S::F32_LANES, 4 | 8) } {
+                blended.fill::<S, 2>(s, batch, first, blending, canvas, transmittance)
+            } else {
+                blended.fill::<S, 1>(s, batch, first, blending, canvas, transmittance)
+            };
             for (i, splat) in batch.splats[..chunk.len()].iter().enumerate().rev() {
                 let mut todo = batch.patches_of[i];
                 let colour = each!(i in 3 => c(splat.colour[i]));
                 let at_depth = c(depth.value(splat.depth));
                 let y2_u = c(-splat.l1 * splat.shear);
                 let zero = V::zero(s);
-                let mut sums = Sums {
-                    base: [zero; BASE],
-                    abs: [zero; 2],
+                let mut moments = Moments { q: [zero; field::COLOUR], abs: [zero; 2] };
+                let mut sums = ColourSums {
+                    colour: [zero; 3],
                     weight: zero,
                     pixels: zero,
                     error: zero,
@@ -297,7 +345,6 @@ impl RasterizeBwd<'_> {
                     ends[p] -= 1;
                     let pair = ends[p] % PAIRS;
                     for at in (0..WIDTH).step_by(S::F32_LANES) {
-                        let [u, z] = batch.u_and_z(s, i, p, at);
                         let alpha = V::load(s, &blended.alpha[pair][at..]);
                         let part = V::load(s, &blended.weight[pair][at..]);
                         let w = part * V::load(s, &transmittance[p][at..]);
@@ -329,40 +376,44 @@ impl RasterizeBwd<'_> {
                         alpha.mul_add(cg_minus_b, old_b).store(&mut behind[p][at..]);
                         // Alpha has no gradient at its clamp.
                         let q = alpha.lt(c(ALPHA_MAX)).keep(w * cg_minus_b);
-                        let qu = q * u;
-                        let qz = q * z;
-                        let base = &mut sums.base;
-                        base[field::Q] = base[field::Q] + q;
-                        base[field::U] = base[field::U] + qu;
-                        base[field::Z] = base[field::Z] + qz;
-                        base[field::UU] = qu.mul_add(u, base[field::UU]);
-                        base[field::UZ] = qu.mul_add(z, base[field::UZ]);
-                        base[field::ZZ] = qz.mul_add(z, base[field::ZZ]);
-                        base[field::COLOUR] = w.mul_add(r, base[field::COLOUR]);
-                        base[field::COLOUR + 1] = w.mul_add(g, base[field::COLOUR + 1]);
-                        base[field::COLOUR + 2] = w.mul_add(b, base[field::COLOUR + 2]);
+                        sums.colour[0] = w.mul_add(r, sums.colour[0]);
+                        sums.colour[1] = w.mul_add(g, sums.colour[1]);
+                        sums.colour[2] = w.mul_add(b, sums.colour[2]);
                         if EXTRAS & extra::LARGEST != 0 {
                             sums.weight_max = sums.weight_max.max(w);
-                        }
-                        if EXTRAS & extra::ABS != 0 {
-                            sums.abs[0] = sums.abs[0] + qu.abs();
-                            let y2 = y2_u.mul_add(qu, qz * splat.l3);
-                            sums.abs[1] = sums.abs[1] + y2.abs();
                         }
                         if EXTRAS & extra::WEIGHTS != 0 {
                             sums.weight = sums.weight + w;
                             sums.pixels = sums.pixels + zero.lt(w).keep(c(1.0));
                         }
+                        if one_walk {
+                            let at_pixel = batch.u_and_z(s, i, p, at);
+                            moments.add::<EXTRAS>(q, at_pixel, y2_u, splat.l3);
+                        } else {
+                            q.store(&mut blended.alpha[pair][at..]);
+                        }
+                    }
+                }
+                let mut todo = if one_walk { 0 } else { batch.patches_of[i] };
+                while todo != 0 {
+                    let p = todo.trailing_zeros() as usize % WIDTH;
+                    todo &= todo - 1;
+                    let pair = ends[p] % PAIRS;
+                    for at in (0..WIDTH).step_by(S::F32_LANES) {
+                        let q = V::load(s, &blended.alpha[pair][at..]);
+                        let at_pixel = batch.u_and_z(s, i, p, at);
+                        moments.add::<EXTRAS>(q, at_pixel, y2_u, splat.l3);
                     }
                 }
                 let mut record = [0.0; RecordLayout::MOST];
-                let [q, u, z, uu, uz, zz, red, green, blue] = sums.base;
+                let [q, u, z, uu, uz, zz] = moments.q;
+                let [red, green, blue] = sums.colour;
                 record[..4].copy_from_slice(&sums_of_four([q, u, z, uu]));
                 record[4..8].copy_from_slice(&sums_of_four([uz, zz, red, green]));
                 record[field::COLOUR + 2] = blue.sum();
                 if EXTRAS & extra::ABS != 0 {
-                    record[Field::AbsX.number()] = sums.abs[0].sum();
-                    record[Field::AbsY.number()] = sums.abs[1].sum();
+                    record[Field::AbsX.number()] = moments.abs[0].sum();
+                    record[Field::AbsY.number()] = moments.abs[1].sum();
                 }
                 if EXTRAS & extra::WEIGHTS != 0 {
                     record[Field::WeightSum.number()] = sums.weight.sum();
