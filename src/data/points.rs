@@ -36,6 +36,11 @@ impl PointCloud {
         self.positions.is_empty()
     }
 
+    /// Bytes of all points.
+    pub fn bytes(&self) -> u64 {
+        (size_of_val(&self.positions[..]) + size_of_val(&self.colours[..])) as u64
+    }
+
     /// At most `limit` of the points, at equal intervals in their order.
     pub fn thinned(&self, limit: usize) -> Self {
         let stride = self.len().div_ceil(limit.max(1)).max(1);

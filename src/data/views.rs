@@ -2,6 +2,7 @@
 
 use std::error::Error;
 use std::path::Path;
+use std::sync::Arc;
 
 use crate::dataset::View;
 use crate::dataset::images::{ImageCache, Loaded};
@@ -122,6 +123,43 @@ impl ViewSource for DatasetViews {
 
     fn prefetch(&self, upcoming: &[usize]) {
         self.cache.prefetch(upcoming);
+    }
+}
+
+/// Views whose cameras have smaller images than the dataset: the dataset's are shrunk whenever they are used.
+#[derive(Debug)]
+pub struct ShrunkViews(pub DatasetViews);
+
+impl ViewSource for ShrunkViews {
+    fn count(&self) -> usize {
+        self.0.count()
+    }
+
+    fn name(&self, view: usize) -> &str {
+        self.0.name(view)
+    }
+
+    fn camera(&self, view: usize) -> &Camera {
+        self.0.camera(view)
+    }
+
+    fn image(&self, view: usize) -> Result<SharedImage, ViewError> {
+        let Camera { width, height, .. } = *self.camera(view);
+        Ok(Arc::new(self.0.image(view)?.shrunk(width, height)))
+    }
+
+    fn image_with_depth(
+        &self,
+        view: usize,
+    ) -> Result<(SharedImage, Option<SharedDepth>), ViewError> {
+        let Camera { width, height, .. } = *self.camera(view);
+        let (image, depth) = self.0.image_with_depth(view)?;
+        let depth = depth.map(|depth| Arc::new(depth.shrunk(width, height)));
+        Ok((Arc::new(image.shrunk(width, height)), depth))
+    }
+
+    fn prefetch(&self, upcoming: &[usize]) {
+        self.0.prefetch(upcoming);
     }
 }
 

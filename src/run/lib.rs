@@ -29,8 +29,8 @@ pub use near_plane::NearPlane;
 pub use observer::{Interrupt, NextAction, Observer, Silent, check_interrupt, say_notes};
 pub use process::{MemoryLimit, ProcessMemory, grant};
 pub use resolved::{
-    Alternatives, DEFAULT_BUDGET, DegreeSource, ExposureSource, Extent, Findings, ModelSize, Plan,
-    PoseSource, RunConfig, VignetteSource, estimate, extent, plan,
+    Alternatives, DEFAULT_BUDGET, DegreeSource, DegreeTrial, ExposureSource, Extent, Findings,
+    ModelSize, Plan, PoseSource, RunConfig, VignetteSource, estimate, extent, plan,
 };
 pub use session::{LeftOut, Occupied, Reductions, Requirements, Resumed, Run, start};
 pub use spec::{

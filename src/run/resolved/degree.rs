@@ -4,7 +4,7 @@ use std::ops::RangeInclusive;
 
 use super::inputs::Evidence;
 use super::sources::DegreeSource;
-use crate::spec::{RunSpec, ShDegree};
+use crate::spec::{InitChoice, RunSpec, ShDegree};
 use densify_core::gaussians::MAX_SH_DEGREE;
 use densify_core::numbers::grouped;
 use densify_data::track_colours::{self, MIN_TRACKS};
@@ -22,7 +22,20 @@ impl Degree {
         *self.range.end()
     }
 
-    /// Decides the degree by the options, or with `auto` by the colours of the dataset's tracks, if there are enough.
+    /// True if trial runs decide the degree: a memory limit decides the number of rows, which depends on the degree, and
+    /// no given model has colours already.
+    fn is_tried(spec: &RunSpec) -> bool {
+        let has_model = matches!(spec.start.init, Some(InitChoice::Model(_)));
+        spec.size.memory.is_some() && !has_model && spec.start.freeze.is_none()
+    }
+
+    /// True if the colours of the tracks decide the degree.
+    pub(super) fn is_by_colours(spec: &RunSpec) -> bool {
+        spec.size.sh_degree == Some(ShDegree::Auto(None)) && !Self::is_tried(spec)
+    }
+
+    /// Decides the degree by the options, or with `auto` by the colours of the dataset's tracks, if there are enough. If
+    /// [trial runs](super::DegreeTrial) are to decide, it is the highest for now.
     /// In a resumed run the degree is a number, and `source` the original reason for it.
     pub(super) fn decide(
         spec: &RunSpec,
@@ -36,6 +49,9 @@ impl Degree {
             }
             None if spec.size.full => given(MAX_SH_DEGREE..=MAX_SH_DEGREE),
             None => given(0..=MAX_SH_DEGREE),
+            Some(ShDegree::Auto(None)) if Self::is_tried(spec) => {
+                Self { range: 0..=MAX_SH_DEGREE, source: DegreeSource::Untried }
+            }
             Some(ShDegree::Auto(None)) => {
                 let colours = evidence.colours.as_ref();
                 let spread = colours.map(|all| track_colours::measure(&evidence.tracks, all));
@@ -52,7 +68,11 @@ impl Degree {
     /// A line for the user with the evidence for an automatic choice.
     pub(super) fn line(&self) -> Option<String> {
         match self.source {
-            DegreeSource::Given => None,
+            // About trial runs that are to be made, see `trial.rs`.
+            DegreeSource::Given | DegreeSource::Untried => None,
+            DegreeSource::Trial(trial) => {
+                Some(format!("colour   degree {} (auto): {}", self.highest(), trial.describe()))
+            }
             DegreeSource::Spread(spread) => Some(format!(
                 "colour   degree {} (auto): the colour of a twentieth of {} points varies by {:.1}/255 or more \
                  between the views that see them",

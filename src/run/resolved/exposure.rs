@@ -95,6 +95,12 @@ impl Exposure {
         exposure
     }
 
+    /// Drops the initial exposures of all views but those that `keeps` names by their numbers.
+    pub(super) fn keep(&mut self, keeps: impl Fn(usize) -> bool) {
+        let mut numbers = 0..;
+        self.gains.retain(|_| numbers.next().is_some_and(&keeps));
+    }
+
     /// The exposures that the run starts with, if exposures are learned.
     pub(crate) fn initial(&self, spec: &RunSpec, dataset: &Dataset) -> Option<Exposures> {
         let alike = vec![[1.0; 3]; dataset.train.len()];

@@ -21,6 +21,7 @@ mod sources;
 #[cfg(test)]
 mod tests;
 mod training;
+mod trial;
 mod vignette;
 
 pub(crate) use case::{Case, DECODERS, Init, TEST_DECODERS};
@@ -34,13 +35,15 @@ pub(crate) use geometry_measurement::GeometryMeasurement;
 pub(crate) use models::{importance_setup, read};
 pub use plan::{Alternatives, Plan, plan};
 pub use size::DEFAULT_BUDGET;
-pub use sources::{DegreeSource, ExposureSource, PoseSource, VignetteSource};
+pub use sources::{DegreeSource, DegreeTrial, ExposureSource, PoseSource, VignetteSource};
 pub(crate) use training::ResolvedTraining;
+pub(crate) use trial::TrialRuns;
 
 use crate::failure::Failure;
 use crate::host::Host;
 use crate::spec::RunSpec;
 use size::Size;
+use trial::HELD_OUT;
 
 /// A run with every choice made, before its first model exists.
 pub(crate) struct ResolvedRun<'a> {
@@ -64,7 +67,21 @@ impl<'a> ResolvedRun<'a> {
         let case = Case::for_new_run(spec, host)?;
         let size = Size::choose(&case)?;
         let degree_lowered = size.is_lowered(&case);
-        Ok(Self::new(case, &size, degree_lowered, host))
+        let trial = case.trial_line(&size.run_size)?;
+        let mut run = Self::new(case, &size, degree_lowered, host);
+        run.reasons.extend(trial);
+        Ok(run)
+    }
+
+    /// Resolves a trial run. It has images of half the size, of which one in [`HELD_OUT`] is not trained on but tested.
+    ///
+    /// # Errors
+    /// As [`for_new_run`](Self::for_new_run).
+    pub(crate) fn for_trial(&'a self, spec: &'a RunSpec, host: Host<'_>) -> Result<Self, Failure> {
+        let mut case = self.case.with(spec)?;
+        case.halve_and_hold_out(HELD_OUT);
+        let size = Size::as_given(&case)?;
+        Ok(Self::new(case, &size, false, host))
     }
 
     /// Resolves a resumed run with the choices of `saved`. `spec` is the saved description overlaid with the options

@@ -47,6 +47,13 @@ impl RefinedPoses {
         Self { is_on, source, adjusted: if is_on && is_known { adjusted } else { Vec::new() } }
     }
 
+    /// Drops the adjusted cameras of all views but those that `keeps` names by their numbers, and changes these.
+    pub(super) fn keep(&mut self, keeps: impl Fn(usize) -> bool, change: fn(&Camera) -> Camera) {
+        let numbered = self.adjusted.iter().enumerate();
+        self.adjusted =
+            numbered.filter(|(view, _)| keeps(*view)).map(|(_, camera)| change(camera)).collect();
+    }
+
     /// The poses that the run starts with, if poses are refined.
     pub(crate) fn initial(&self, spec: &RunSpec, dataset: &Dataset, extent: f32) -> Option<Poses> {
         if !self.is_on {

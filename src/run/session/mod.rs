@@ -2,6 +2,7 @@
 //! checkpoints. The file is not split because all of this happens between two steps, and the order matters.
 
 mod coordinates;
+mod degree_trial;
 mod first_model;
 mod geometry;
 mod prepare;
@@ -37,7 +38,7 @@ use densify_train::output::{
 use densify_train::trainer::{StepReport, TrainError};
 use densify_train::vignette::named_vignettes;
 use geometry::measure;
-use records::{Logs, Totals};
+use records::{Logs, Spent, Totals};
 
 /// The file beside a model with the exposures of the training views.
 const EXPOSURES: &str = "exposure.json";
@@ -167,7 +168,7 @@ impl<'a> Session<'a> {
         write_cameras(&run, folder, None)?;
         let mut checkpoint = None;
         let (logs, totals) = match run.session.take() {
-            None => (Logs::create(folder)?, Totals::new()),
+            None => (Logs::create(folder)?, Totals::after(run.spent)),
             Some(saved) => {
                 checkpoint = Some(run.trainer.steps_done());
                 let (logs, totals, lost) = Logs::resume(folder, saved)?;
@@ -320,7 +321,7 @@ impl<'a> Session<'a> {
         let (wall, cpu) = (Instant::now(), ProcessTime::try_now().ok());
         let train_views = self.run.dataset.train.len();
         let stepped = self.run.trainer.step();
-        self.totals.time(wall, cpu);
+        self.totals.add(Spent::since(wall, cpu));
         for &(stage, time) in self.run.trainer.backend().stage_times() {
             self.totals.stage(stage, time);
         }

@@ -3,6 +3,7 @@
 
 use std::path::Path;
 
+use super::degree_trial;
 use super::first_model::{append_to_frozen, check_coordinates, first_model};
 use super::resume::{self, Resumed};
 use super::run::Run;
@@ -11,10 +12,12 @@ use crate::host::Host;
 use crate::observer::Observer;
 use crate::resolved::{DECODERS, Init, ResolvedRun, ResolvedTraining, RunConfig, TEST_DECODERS};
 use crate::spec::RunSpec;
+use densify_core::gaussians::Gaussians;
 use densify_core::memory::Bytes;
 use densify_core::numbers::grouped;
 use densify_data::dataset::PointCloud;
-use densify_data::views::DatasetViews;
+use densify_data::views::{DatasetViews, ViewSource};
+use densify_render::Backend;
 use densify_train::checkpoint::Fingerprint;
 use densify_train::init::apply_start_rule;
 use densify_train::schedule::RateOptions;
@@ -34,35 +37,24 @@ pub(super) fn prepare(
     spec.check_iterations(last)?;
     let output = spec.output_folder()?;
     let checkpoint = resumed.as_ref().and_then(|resumed| resumed.checkpoint.as_ref());
-    let run = match &resumed {
-        None => ResolvedRun::for_new_run(spec, host)?,
+    let (run, spent) = match &resumed {
+        None => degree_trial::decide(ResolvedRun::for_new_run(spec, host)?, host)?,
         Some(resumed) => {
-            ResolvedRun::from_saved(spec, &resumed.config, checkpoint.is_some(), host)?
+            (ResolvedRun::from_saved(spec, &resumed.config, checkpoint.is_some(), host)?, None)
         }
     };
     if !spec.output.test_iterations.is_empty() && run.case.inputs.dataset.test.is_empty() {
         return Err(OptionProblem::NothingToTest.into());
     }
     run.check_grant(process, resumed.is_some())?;
-    let mut model = match checkpoint {
-        None => first_model(&run, observer)?,
-        Some(checkpoint) => checkpoint.blank_model()?,
-    };
-    model.antialiasing = run.case.choices.antialiasing;
-    let initial_rows =
-        checkpoint.map_or(model.len(), |checkpoint| checkpoint.header().trainer.initial_rows);
-    let training = ResolvedTraining::new(&run, initial_rows)?;
-    let file = match &run.init {
-        Init::Model(file) => Some(file.0.clone()),
-        Init::Points | Init::Random(_) => None,
-    };
-    if checkpoint.is_none() {
-        // A given model keeps its opacities and scales, even if the policy prescribes initial ones.
-        if file.is_none() {
-            apply_start_rule(&mut model, &training.declared.start);
+    let (model, training) = match checkpoint {
+        None => start(&run, observer)?,
+        Some(checkpoint) => {
+            let mut model = checkpoint.blank_model()?;
+            model.antialiasing = run.case.choices.antialiasing;
+            (model, ResolvedTraining::new(&run, checkpoint.header().trainer.initial_rows)?)
         }
-        model = append_to_frozen(&run, model, observer)?;
-    }
+    };
     let config = RunConfig::new(&run, &training, last)?;
     let fingerprint = Fingerprint::new(&run.case.inputs.dataset);
     if let Some(resumed) = &resumed {
@@ -71,36 +63,25 @@ pub(super) fn prepare(
     }
     announce(&run, &training, &output, observer);
     let ResolvedRun { case, size, .. } = &run;
-    let needs = case.backend_needs(training.declared.clone());
-    let ledger = case.ledger(size, &needs);
+    let ledger = case.ledger(size, &case.backend_needs(training.declared.clone()));
     run.check_memory(&ledger)?;
     let total = Bytes(ledger.total());
     observer.say(format_args!("memory   {total} promised in all"));
     observer.detail(format_args!("{}", case.memory_table(&ledger, observer.spelling())));
     let geometry_measurement = case.geometry_measurement(size, case.choices.threads);
-    let mut backend = case.inputs.device.backend(&model, &case.backend_setup(size, needs))?;
-    drop(model);
-    if let Some(file) = file.filter(|_| checkpoint.is_none()) {
-        check_coordinates(&file, &run, backend.as_mut(), observer)?;
-    }
-    let options = train_options(&run, training.rates);
-    let ResolvedRun { case, size, .. } = run;
-    let exposures = case.choices.exposure.initial(spec, &case.inputs.dataset);
-    let extent = training.scene.extent;
-    let poses = case.choices.poses.initial(spec, &case.inputs.dataset, extent);
-    let vignettes = case.choices.vignette.initial(&case.inputs.dataset);
-    let (name, automatic) = (case.choices.entry.name, case.choices.automatic);
-    let mut dataset = case.inputs.into_owned().dataset;
-    let views = DatasetViews::new(dataset.train.clone(), size.image_cache, DECODERS);
-    views.check_visible(&dataset.root)?;
+    let views = DatasetViews::new(case.inputs.dataset.train.clone(), size.image_cache, DECODERS);
+    views.check_visible(&case.inputs.dataset.root)?;
+    let mut trainer = trainer(&run, model, training, views, |backend| match &run.init {
+        Init::Model(file) if checkpoint.is_none() => {
+            check_coordinates(&file.0, &run, backend, observer)
+        }
+        _ => Ok(()),
+    })?;
+    let mut dataset = run.case.inputs.into_owned().dataset;
     let test = DatasetViews::new(dataset.test.clone(), 0, TEST_DECODERS);
     // Once the first rows are made, training needs no points.
     dataset.points = companion
         .map_or_else(PointCloud::default, |companion| dataset.points.thinned(companion.points));
-    let ResolvedTraining { policy, scene, .. } = training;
-    let trainer = Trainer::new(views, backend, (name, policy), scene, options)?;
-    let trainer = trainer.with_auto_choices(automatic).with_exposures(exposures);
-    let mut trainer = trainer.with_vignettes(vignettes).with_poses(poses);
     let session = match resumed {
         Some(resumed) => resume::restore(resumed, &mut trainer, observer)?,
         None => None,
@@ -120,8 +101,55 @@ pub(super) fn prepare(
         fingerprint,
         last,
         session,
+        spent,
         process,
     })
+}
+
+/// The first model of a new run, and its training.
+///
+/// # Errors
+/// When a model or a parameter is unsuitable.
+pub(super) fn start(
+    run: &ResolvedRun<'_>,
+    observer: &dyn Observer,
+) -> Result<(Gaussians, ResolvedTraining), Failure> {
+    let mut model = first_model(run, observer)?;
+    model.antialiasing = run.case.choices.antialiasing;
+    let training = ResolvedTraining::new(run, model.len())?;
+    // A given model keeps its opacities and scales, even if the policy prescribes initial ones.
+    if !matches!(run.init, Init::Model(_)) {
+        apply_start_rule(&mut model, &training.declared.start);
+    }
+    Ok((append_to_frozen(run, model, observer)?, training))
+}
+
+/// The trainer of a run that starts with `model`. `check` receives the backend before it trains.
+///
+/// # Errors
+/// When the device or `check` fails.
+pub(super) fn trainer<V: ViewSource>(
+    run: &ResolvedRun<'_>,
+    model: Gaussians,
+    training: ResolvedTraining,
+    views: V,
+    check: impl FnOnce(&mut dyn Backend) -> Result<(), Failure>,
+) -> Result<Trainer<V>, Failure> {
+    let ResolvedRun { case, size, .. } = run;
+    let ResolvedTraining { policy, scene, declared, rates, .. } = training;
+    let setup = case.backend_setup(size, case.backend_needs(declared));
+    let mut backend = case.inputs.device.backend(&model, &setup)?;
+    drop(model);
+    check(backend.as_mut())?;
+    let (choices, dataset) = (&case.choices, &case.inputs.dataset);
+    let poses = choices.poses.initial(case.spec, dataset, scene.extent);
+    let policy = (choices.entry.name, policy);
+    let trainer = Trainer::new(views, backend, policy, scene, train_options(run, rates))?;
+    Ok(trainer
+        .with_auto_choices(choices.automatic)
+        .with_exposures(choices.exposure.initial(case.spec, dataset))
+        .with_vignettes(choices.vignette.initial(dataset))
+        .with_poses(poses))
 }
 
 fn train_options(run: &ResolvedRun<'_>, rates: RateOptions) -> TrainOptions {

@@ -18,9 +18,9 @@ use densify_train::output::{Mean, RecordLog, StepRecord, TensorBoard};
 #[serde(deny_unknown_fields)]
 pub(super) struct Totals {
     window: Window,
-    /// Wall time of all steps.
+    /// Wall time of all steps and of trial runs before them.
     pub(super) wall: Duration,
-    /// Processor time of all steps, if the system measures it.
+    /// Processor time of the same, if the system measures it.
     pub(super) cpu: Option<Duration>,
     /// Wall time by stage.
     pub(super) stages: BTreeMap<String, Duration>,
@@ -31,6 +31,22 @@ pub(super) struct Totals {
     pub(super) tested: BTreeMap<u32, Mean>,
     /// Peak resident memory of earlier processes of this run `[bytes]`.
     peak_before: Option<u64>,
+}
+
+/// Time that a part of a run took.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Spent {
+    wall: Duration,
+    /// Processor time, if the system measures it.
+    cpu: Option<Duration>,
+}
+
+impl Spent {
+    /// The time since `wall` and `cpu`.
+    pub(super) fn since(wall: Instant, cpu: Option<ProcessTime>) -> Self {
+        let cpu = cpu.and_then(|start| start.try_elapsed().ok());
+        Self { wall: wall.elapsed(), cpu }
+    }
 }
 
 /// Sums over the steps since the last record.
@@ -47,15 +63,16 @@ struct Window {
 }
 
 impl Totals {
-    pub(super) fn new() -> Self {
-        Self { cpu: Some(Duration::ZERO), ..Self::default() }
+    /// The totals of a run that begins, after the time that was spent before its first step.
+    pub(super) fn after(spent: Option<Spent>) -> Self {
+        let mut totals = Self { cpu: Some(Duration::ZERO), ..Self::default() };
+        totals.add(spent.unwrap_or(Spent { wall: Duration::ZERO, cpu: Some(Duration::ZERO) }));
+        totals
     }
 
-    /// Adds the wall time since `wall` and the processor time since `cpu`.
-    pub(super) fn time(&mut self, wall: Instant, cpu: Option<ProcessTime>) {
-        self.wall = self.wall.saturating_add(wall.elapsed());
-        let spent = cpu.and_then(|start| start.try_elapsed().ok());
-        self.cpu = self.cpu.zip(spent).map(|(sum, spent)| sum.saturating_add(spent));
+    pub(super) fn add(&mut self, spent: Spent) {
+        self.wall = self.wall.saturating_add(spent.wall);
+        self.cpu = self.cpu.zip(spent.cpu).map(|(sum, cpu)| sum.saturating_add(cpu));
     }
 
     pub(super) fn stage(&mut self, stage: &str, time: Duration) {

@@ -186,20 +186,27 @@ fn degree_left_out(config: &RunConfig) -> Option<LeftOut> {
             loss: "the cost in quality was not measured".to_owned(),
         });
     }
-    // Any other degree below the highest was set by an option.
-    let DegreeSource::Spread(spread) = config.resolved.sh_degree_from else { return None };
-    Some(LeftOut {
-        what,
-        evidence: format!(
-            "the colour of a twentieth of {} points varies by {:.2}/255 or more between the views that see them",
-            spread.tracks, spread.twentieth
-        ),
-        loss: format!(
-            "the colours of all these points vary by {:.2}/255 (rms); with as many rows, degree 3 still gained \
-             0.5 to 1.4 dB on matt scenes (docs/tradeoffs.md)",
-            spread.rms
-        ),
-    })
+    match config.resolved.sh_degree_from {
+        // A degree below the highest was set by an option.
+        DegreeSource::Given | DegreeSource::Undecided | DegreeSource::Untried => None,
+        DegreeSource::Trial(trial) => Some(LeftOut {
+            what,
+            evidence: trial.describe(),
+            loss: "none: memory that colours do not take holds more Gaussians".to_owned(),
+        }),
+        DegreeSource::Spread(spread) => Some(LeftOut {
+            what,
+            evidence: format!(
+                "the colour of a twentieth of {} points varies by {:.2}/255 or more between the views that see them",
+                spread.tracks, spread.twentieth
+            ),
+            loss: format!(
+                "the colours of all these points vary by {:.2}/255 (rms); with as many rows, degree 3 still gained \
+                 0.5 to 1.4 dB on matt scenes (docs/tradeoffs.md)",
+                spread.rms
+            ),
+        }),
+    }
 }
 
 fn exposures_left_out(config: &RunConfig) -> Option<LeftOut> {

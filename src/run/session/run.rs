@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use super::records::SavedSession;
+use super::records::{SavedSession, Spent};
 use super::resume::Resumed;
 use super::{Occupied, prepare, train};
 use crate::failure::Failure;
@@ -42,6 +42,8 @@ pub struct Run {
     pub(super) last: u32,
     /// State of the logs, for a resumed run.
     pub(super) session: Option<SavedSession>,
+    /// Time spent before the first step on trial runs, if there were any.
+    pub(super) spent: Option<Spent>,
     pub(super) process: ProcessMemory,
 }
 

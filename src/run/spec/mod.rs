@@ -282,8 +282,9 @@ run_spec! {
         /// Dependence of colours on the viewing direction: 0 none, 3 most; auto: as much as the scene requires
         /// (default: 3, or lower if --memory requires it)
         ///
-        /// auto is decided before training, by how much the photographs disagree about the colours of the
-        /// reconstruction's points. With too few points, it is 3
+        /// Within --memory, auto makes two short trial runs and takes 0 if the Gaussians that then fit are worth more
+        /// than view-dependent colours. Otherwise it is decided by how much the photographs disagree about the colours
+        /// of the reconstruction's points; with too few points, it is 3
         sh_degree: Option<ShDegree> = None, Fixed, value "DEGREE";
 
         /// Disable automatic reductions: degree 3 unless --sh-degree says otherwise, and all views

@@ -137,3 +137,65 @@ fn contradictory_flags_are_both_named() {
     let again = train(scene.path(), &run, "--resume --full");
     again.refused("--resume", &["--resume", "--full"]);
 }
+
+#[test]
+#[ignore = "takes minutes: run by .ci/run"]
+fn a_degree_decided_by_trial_runs_survives_resuming() {
+    let (root, whole) = scratch();
+    let flags = "-r 2 --memory 64MiB --sh-degree auto --iterations 5000 --backend cpu";
+    let outcome =
+        call(&format!("train scene:spheres -o {} {flags} --checkpoint-every 2500", text(&whole)));
+    let outcome = outcome.ok();
+    let line = "colour   degree 3 (auto): in trial runs of 1,000 iterations";
+    assert!(outcome.stdout.contains(line), "{}", outcome.stdout);
+    let found = report(&whole);
+    let trial = &found["sh_degree_from"]["trial"];
+    let pair = |field: &str| [0, 1].map(|at| trial[field][at].as_f64().expect("a number"));
+    let ([low, high], [many, few]) = (pair("psnr"), pair("rows"));
+    assert!(many > 1.5 * few && low.min(high) > 20.0 && low - high < 1.0, "{trial}");
+    assert_eq!((&found["sh_degree"], &found["left_out"]), (&3.into(), &serde_json::json!([])));
+    let part = root.path().join("part");
+    copy_unfinished(&whole, &part, 5_000);
+    let again = call(&format!("train -o {} --resume", text(&part))).ok();
+    assert!(!again.stdout.contains("two trial runs"), "{}", again.stdout);
+    assert!(model(&part, 5_000) == model(&whole, 5_000), "{}", part.display());
+    assert_eq!(report(&part), found);
+}
+
+/// In the room of layers, more Gaussians are worth more than view-dependent colours.
+#[test]
+#[ignore = "takes minutes: run by .ci/run"]
+fn trial_runs_choose_more_gaussians_where_they_pay() {
+    let (_root, run) = scratch();
+    let flags = "-r 2 --memory 84MiB --sh-degree auto --iterations 5000 --backend cpu";
+    let outcome = call(&format!("train scene:layers -o {} {flags}", text(&run))).ok();
+    assert!(
+        outcome.stdout.contains("colour   degree 0 (auto): in trial runs"),
+        "{}",
+        outcome.stdout
+    );
+    let found = report(&run);
+    assert_eq!(found["sh_degree"], 0);
+    let evidence = found["left_out"][0]["evidence"].as_str().expect("a text");
+    assert!(evidence.starts_with("in trial runs of 1,000 iterations"), "{found}");
+    let summary = json(&run.join("stats/summary.json"));
+    let bytes = |field: &str| summary[field].as_u64().expect("a number");
+    assert!(bytes("peak_bytes") <= bytes("memory"), "{summary}");
+}
+
+#[test]
+fn what_prevents_trial_runs_is_said() {
+    let scene = Photographs::colmap_text();
+    let few = text(scene.path());
+    for (scene, flags, words) in [
+        ("scene:spheres", "--memory 90MiB -i 5000 -r 2", "degree 3 or 0 (auto): two trial runs of"),
+        ("scene:spheres", "--memory 90MiB -i 4999 -r 2", "at least 5,000 iterations"),
+        ("scene:spheres", "--memory 90MiB -i 5000 -r 4", "still have 32 px at half the size"),
+        ("scene:spheres", "--memory 90MiB -i 5000 -r 2 -b 2k", "no more Gaussians would fit"),
+        (few, "--memory 90MiB -i 5000", "at least 16 training views"),
+    ] {
+        let planned = call(&format!("plan {scene} --backend cpu --sh-degree auto {flags}")).ok();
+        let line = planned.stdout.lines().find(|line| line.starts_with("colour "));
+        assert!(line.is_some_and(|line| line.contains(words)), "{flags}: {}", planned.stdout);
+    }
+}

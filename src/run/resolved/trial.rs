@@ -1,0 +1,161 @@
+//! The trial runs that decide the degree of `--sh-degree auto` within `--memory`: which are made, and what follows.
+//!
+//! At a lower degree, memory holds up to twice as many Gaussians. Which of the two gives the better images depends on the
+//! scene, and no property of the photographs is known that predicts it. Two short runs do, with half the resolution,
+//! a quarter of the rows and a fifth of the iterations, which take 10 to 20 %
+//! of the time of the run (`docs/studies/sh-degree-trial.tsv`).
+
+use super::case::Case;
+use super::degree::Degree;
+use super::size::{Size, rows_at};
+use super::sources::{DegreeSource, DegreeTrial};
+use super::{ResolvedRun, RunSize};
+use crate::failure::Failure;
+use crate::host::Host;
+use crate::spec::{Budget, ImageCache, Rows, RunSpec, ShDegree, Whole};
+use densify_core::numbers::grouped;
+
+/// A run is this many times as long as a trial run.
+const SHORTER: u32 = 5;
+/// A trial run has this many times fewer rows, and as many fewer pixels, which are halved along both sides.
+const SMALLER: usize = 4;
+/// Fewest iterations of a trial run in which policies reach their budget.
+const MIN_ITERATIONS: u32 = 1_000;
+/// One training view of this many is held out.
+pub(super) const HELD_OUT: usize = 8;
+/// Fewest training views, so that two are held out.
+const MIN_VIEWS: usize = 2 * HELD_OUT;
+/// Smallest width or height of the images of a trial run, whichever is larger `[px]`.
+const MIN_SIDE: u32 = 32;
+
+/// Why a run makes no trial runs, although memory decides its degree.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Obstacle {
+    Iterations,
+    Views,
+    Images,
+    Rows,
+    Memory,
+}
+
+impl Obstacle {
+    fn reason(self) -> String {
+        match self {
+            Self::Iterations => format!(
+                "trial runs take a run of at least {} iterations",
+                grouped((SHORTER * MIN_ITERATIONS) as usize)
+            ),
+            Self::Views => format!("trial runs take at least {MIN_VIEWS} training views"),
+            Self::Images => {
+                format!("trial runs take images that still have {MIN_SIDE} px at half the size")
+            }
+            Self::Rows => "no more Gaussians would fit".to_owned(),
+            Self::Memory => "the scene leaves too little memory for trial runs".to_owned(),
+        }
+    }
+}
+
+/// Descriptions of the trial runs.
+#[derive(Debug, Clone)]
+pub(crate) struct TrialRuns {
+    /// Length of each run.
+    pub(crate) iterations: u32,
+    /// Degree of the second run, the highest that fits; that of the first is 0.
+    pub(crate) highest: u8,
+    /// Rows of the two runs.
+    pub(crate) rows: [usize; 2],
+    /// The two runs.
+    pub(crate) specs: [RunSpec; 2],
+}
+
+impl ResolvedRun<'_> {
+    /// The trial runs that decide the degree; `None` if nothing is to be decided.
+    ///
+    /// # Errors
+    /// When a description contradicts itself.
+    pub(crate) fn trial_runs(&self) -> Result<Option<TrialRuns>, Failure> {
+        Ok(self.case.find_trial(&self.size)?.and_then(Result::ok))
+    }
+
+    /// The same run with the degree that the trial runs decide.
+    ///
+    /// # Errors
+    /// When no model fits.
+    pub(crate) fn decided_by(self, trial: DegreeTrial, host: Host<'_>) -> Result<Self, Failure> {
+        let mut case = self.case;
+        case.choices.degree =
+            Degree { range: 0..=trial.degree(), source: DegreeSource::Trial(trial) };
+        let size = Size::choose(&case)?;
+        let degree_lowered = size.is_lowered(&case);
+        Ok(Self::new(case, &size, degree_lowered, host))
+    }
+}
+
+impl Case<'_> {
+    /// A line for the user if trial runs would decide the degree, or cannot.
+    pub(super) fn trial_line(&self, size: &RunSize) -> Result<Option<String>, Failure> {
+        let degree = size.sh_degree;
+        Ok(self.find_trial(size)?.map(|trial| match trial {
+            Ok(trial) => format!(
+                "colour   degree {degree} or 0 (auto): two trial runs of {} iterations decide when training begins; the \
+                 sizes here are for degree {degree}",
+                grouped(trial.iterations as usize)
+            ),
+            Err(obstacle) => format!(
+                "colour   degree {degree} (auto): not compared with degree 0, because {}",
+                obstacle.reason()
+            ),
+        }))
+    }
+
+    /// The trial runs of a run of this size, or what prevents them; `None` if nothing is to be decided.
+    fn find_trial(&self, size: &RunSize) -> Result<Option<Result<TrialRuns, Obstacle>>, Failure> {
+        let (DegreeSource::Untried, Some(memory)) = (self.choices.degree.source, self.memory())
+        else {
+            return Ok(None);
+        };
+        if size.sh_degree == 0 {
+            return Ok(None);
+        }
+        let iterations = self.spec.schedule.iterations.0 / SHORTER;
+        if iterations < MIN_ITERATIONS {
+            return Ok(Some(Err(Obstacle::Iterations)));
+        }
+        let dataset = &self.inputs.dataset;
+        if dataset.train.len() < MIN_VIEWS {
+            return Ok(Some(Err(Obstacle::Views)));
+        }
+        let (width, height) = dataset.largest_image();
+        if width.max(height) / 2 < MIN_SIDE {
+            return Ok(Some(Err(Obstacle::Images)));
+        }
+        let most = self.spec.size.budget.and_then(Budget::most).unwrap_or(usize::MAX);
+        let lowest = rows_at(self, memory, 0, size.rows)?.unwrap_or(size.rows).min(most);
+        if lowest <= size.rows {
+            return Ok(Some(Err(Obstacle::Rows)));
+        }
+        let (degrees, rows) = ([0, size.sh_degree], [lowest, size.rows].map(|rows| rows / SMALLER));
+        let tile_cap = |rows: usize| rows.max(size.tile_cap / SMALLER);
+        let describe = |degree: u8, rows: usize| {
+            let mut spec = self.spec.clone();
+            spec.size.sh_degree = Some(ShDegree::Fixed(degree));
+            spec.size.budget = Some(Budget::Rows(rows));
+            spec.size.memory = None;
+            spec.size.tile_cap = Some(Rows(tile_cap(rows)));
+            spec.size.image_cache = Some(ImageCache::Bytes(size.image_cache));
+            spec.schedule.iterations = Whole(iterations);
+            spec
+        };
+        let specs = [describe(degrees[0], rows[0]), describe(degrees[1], rows[1])];
+        // The points are in memory twice meanwhile. Buffers for images of full size are an upper limit.
+        let points = dataset.points.bytes();
+        for (sh_degree, rows) in degrees.into_iter().zip(rows) {
+            let size = RunSize { rows, sh_degree, tile_cap: tile_cap(rows), ..*size };
+            let bytes = self.inputs.device.limited_bytes(&self.ledger_of(&size)?);
+            if bytes + points > memory {
+                return Ok(Some(Err(Obstacle::Memory)));
+            }
+        }
+        Ok(Some(Ok(TrialRuns { iterations, highest: size.sh_degree, rows, specs })))
+    }
+}
