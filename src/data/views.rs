@@ -126,9 +126,19 @@ impl ViewSource for DatasetViews {
     }
 }
 
-/// Views whose cameras have smaller images than the dataset: the dataset's are shrunk whenever they are used.
+/// Views whose cameras may have smaller images than the dataset: these are shrunk whenever they are used.
 #[derive(Debug)]
 pub struct ShrunkViews(pub DatasetViews);
+
+impl ShrunkViews {
+    fn shrunk(&self, view: usize, image: SharedImage) -> SharedImage {
+        let Camera { width, height, .. } = *self.camera(view);
+        if (image.width, image.height) == (width, height) {
+            return image;
+        }
+        Arc::new(image.shrunk(width, height))
+    }
+}
 
 impl ViewSource for ShrunkViews {
     fn count(&self) -> usize {
@@ -144,8 +154,7 @@ impl ViewSource for ShrunkViews {
     }
 
     fn image(&self, view: usize) -> Result<SharedImage, ViewError> {
-        let Camera { width, height, .. } = *self.camera(view);
-        Ok(Arc::new(self.0.image(view)?.shrunk(width, height)))
+        Ok(self.shrunk(view, self.0.image(view)?))
     }
 
     fn image_with_depth(
@@ -155,7 +164,7 @@ impl ViewSource for ShrunkViews {
         let Camera { width, height, .. } = *self.camera(view);
         let (image, depth) = self.0.image_with_depth(view)?;
         let depth = depth.map(|depth| Arc::new(depth.shrunk(width, height)));
-        Ok((Arc::new(image.shrunk(width, height)), depth))
+        Ok((self.shrunk(view, image), depth))
     }
 
     fn prefetch(&self, upcoming: &[usize]) {

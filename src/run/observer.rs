@@ -64,6 +64,10 @@ pub trait Observer {
     /// The test views were measured.
     fn tested(&self, _step: u32, _mean: &Mean) {}
 
+    /// A step of a trial run is done, of which there are two before training: the step and the last one, the loss, the
+    /// rows and their budget.
+    fn trial_step(&self, _step: [u32; 2], _loss: f32, _rows: [usize; 2]) {}
+
     /// A checkpoint was written, or could not be written because of `trouble`.
     fn checkpoint_written(&self, _step: u32, _trouble: Option<&str>) {}
 

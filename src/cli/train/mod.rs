@@ -190,6 +190,17 @@ impl Observer for Follower<'_> {
         }
     }
 
+    fn trial_step(&self, [step, last]: [u32; 2], loss: f32, [rows, budget]: [usize; 2]) {
+        if step == 1 {
+            self.listen();
+            self.begin(0, last, budget);
+        }
+        self.step(step, loss, rows);
+        if step == last {
+            self.end();
+        }
+    }
+
     fn end(&self) {
         if let Some(progress) = self.progress.borrow_mut().take() {
             progress.finish();

@@ -4,6 +4,7 @@ use std::ops::Range;
 
 use super::ROWS_PER_TASK;
 use super::adam::BiasCorrection;
+use super::blended::BlendedBatch;
 use super::blocks::{Blocks, planes};
 use super::loss::LossBuffers;
 use super::mask::Masks;
@@ -12,7 +13,7 @@ use super::observe;
 use super::parameters::Parameters;
 use super::project::Splat;
 use super::rasterize::TileCanvas;
-use super::rasterize_bwd::{BlendedBatch, TileGradient};
+use super::rasterize_bwd::TileGradient;
 use super::signals::Accumulators;
 use super::simd::WIDTH;
 use super::summed::GradientSums;

@@ -10,6 +10,7 @@ mod adam;
 mod apply;
 mod audit;
 mod batch;
+mod blended;
 mod blocks;
 mod budget;
 mod candidates;

@@ -26,17 +26,17 @@
 
 use std::sync::atomic::AtomicU64;
 
-use bytemuck::Zeroable;
 use pulp::{Simd, WithSimd};
 
 use super::batch::{BATCH, Batch};
+use super::blended::{BlendedBatch, PAIRS};
 use super::depth_channel::{BY_ALPHA, CENTRE, DepthChannel, SQUARE};
 use super::project::Splat;
 use super::rasterize::{
-    ALPHA_MAX, Aligned, Blending, PATCHES, Plane, TRANSMITTANCE, TileCanvas, TilePlace, ZERO_PLANE,
+    ALPHA_MAX, Aligned, Blending, Plane, TRANSMITTANCE, TileCanvas, TilePlace, ZERO_PLANE,
 };
 use super::records::{TileRecords, write};
-use super::simd::{V, WIDTH, each, exp2_of, sums_of_four};
+use super::simd::{V, WIDTH, each, sums_of_four};
 use super::tiles::Entry;
 use crate::signals::{Field, RecordLayout};
 
@@ -155,18 +155,6 @@ impl WithSimd for RasterizeBwd<'_> {
     }
 }
 
-/// Maximum number of (splat, patch) pairs in a batch.
-const PAIRS: usize = BATCH * PATCHES;
-
-/// Results of the first walk over a batch, one for each (splat, patch) pair, patch by patch.
-#[derive(Zeroable)]
-#[repr(C, align(64))]
-pub(super) struct BlendedBatch {
-    alpha: [[f32; WIDTH]; PAIRS],
-    /// α·Π(1 − α); the product is over the splats of the batch in front of this one.
-    weight: [[f32; WIDTH]; PAIRS],
-}
-
 /// Sums of one entry over the pixels, lane by lane, that the colours of the pixels lead to.
 struct ColourSums<S: Simd> {
     colour: [V<S>; 3],
@@ -205,70 +193,6 @@ impl<S: Simd> Moments<S> {
             let y2 = y2_u.mul_add(qu, qz * l3);
             self.abs[1] = self.abs[1] + y2.abs();
         }
-    }
-}
-
-impl BlendedBatch {
-    /// The first walk over a batch, whose first splat is entry `first` of the list. Changes `transmittance` from the
-    /// transmittance behind the batch to the one in front. Returns the end of each patch's pairs. `N` vectors of a patch
-    /// are computed at a time.
-    #[inline(always)]
-    fn fill<S: Simd, const N: usize>(
-        &mut self,
-        s: S,
-        batch: &Batch,
-        first: usize,
-        blending: Blending,
-        canvas: &TileCanvas,
-        transmittance: &mut Plane,
-    ) -> [usize; PATCHES] {
-        let c = |x: f32| V::splat(s, x);
-        let e_min = c(-blending.log2_reach);
-        let Self { alpha: alphas, weight: weights } = self;
-        let mut ends = [0; PATCHES];
-        let mut start = 0;
-        for p in 0..PATCHES {
-            let reached = batch.splats_of[p];
-            if reached == 0 {
-                continue;
-            }
-            for at in (0..WIDTH).step_by(N * S::F32_LANES) {
-                let mut product = [c(1.0); N];
-                let (mut pair, mut todo) = (start, reached);
-                while todo != 0 {
-                    // The mask has 32 bits; the remainder removes the bounds check of every load.
-                    let i = todo.trailing_zeros() as usize % BATCH;
-                    todo &= todo - 1;
-                    let log2_opacity = c(batch.splats[i].log2_opacity);
-                    let mut e = product;
-                    for (n, e) in e.iter_mut().enumerate() {
-                        let [u, z] = batch.u_and_z(s, i, p, at + n * S::F32_LANES);
-                        *e = u.neg_mul_add(u, z.neg_mul_add(z, log2_opacity));
-                    }
-                    let power = exp2_of(e);
-                    let here = s.splat_u32s((first + i) as u32);
-                    for n in 0..N {
-                        let at = at + n * S::F32_LANES;
-                        let stop = S::as_simd_u32s(&canvas.stop[p][at..]).0[0];
-                        let seen = e_min.le(e[n]).and(super::simd::before(s, here, stop));
-                        let alpha = seen.keep(power[n].min(c(ALPHA_MAX)));
-                        alpha.store(&mut alphas[pair % PAIRS][at..]);
-                        (alpha * product[n]).store(&mut weights[pair % PAIRS][at..]);
-                        product[n] = alpha.neg_mul_add(product[n], product[n]);
-                    }
-                    pair += 1;
-                }
-                for (n, product) in product.into_iter().enumerate() {
-                    // Where the product underflows, the transmittance behind has underflowed too.
-                    let behind = &mut transmittance[p][at + n * S::F32_LANES..];
-                    let t = V::load(s, behind) / product.max(c(f32::MIN_POSITIVE));
-                    t.store(behind);
-                }
-            }
-            start += reached.count_ones() as usize;
-            ends[p] = start;
-        }
-        ends
     }
 }
 

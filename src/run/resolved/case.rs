@@ -13,7 +13,6 @@ use super::fit::RunSize;
 use super::inputs::{Evidence, Inputs, Reading, choose_moments, open_device};
 use super::poses::RefinedPoses;
 use super::size::MIN_ROWS;
-use super::sources::VignetteSource;
 use super::vignette::CameraVignettes;
 use crate::failure::{Failure, ModelProblem, OptionProblem, SizeProblem};
 use crate::host::Host;
@@ -23,7 +22,6 @@ use crate::spec::knobs::Knobs;
 use crate::spec::{AbsolutePath, Budget, InitChoice, RunSpec, ShDegree};
 use densify_core::antialiasing::Antialiasing;
 use densify_core::budget::RowBudget;
-use densify_core::camera::Camera;
 use densify_core::memory::Ledger;
 use densify_core::spelling::Spelling;
 use densify_data::dataset::View;
@@ -278,24 +276,6 @@ impl<'a> Case<'a> {
         Ok(Case { spec, inputs, choices })
     }
 
-    /// Halves the images of the training views, makes one view of `every` a test view, and drops the other test views.
-    /// Vignettes, which belong to whole photographs, are not learned.
-    pub(super) fn halve_and_hold_out(&mut self, every: usize) {
-        let trains = |view: usize| !(view + 1).is_multiple_of(every);
-        let dataset = &mut self.inputs.to_mut().dataset;
-        let mut numbers = 0..;
-        let (train, test) = std::mem::take(&mut dataset.train)
-            .into_iter()
-            .partition(|_| numbers.next().is_some_and(trains));
-        (dataset.train, dataset.test) = (train, test);
-        for view in dataset.train.iter_mut().chain(&mut dataset.test) {
-            view.camera = halved(&view.camera);
-        }
-        self.choices.exposure.keep(trains);
-        self.choices.poses.keep(trains, halved);
-        self.choices.vignette = CameraVignettes::known(false, VignetteSource::Given);
-    }
-
     /// The first rows of a run with this budget.
     pub(super) fn first_rows(&self, rows: usize) -> Init {
         match self.init() {
@@ -393,10 +373,6 @@ impl<'a> Case<'a> {
         let scratch_bytes = needs.scratch_bytes + FLOATER_BYTES;
         Needs { signals, aux: Some(aux), scratch_bytes, ..needs }
     }
-}
-
-fn halved(camera: &Camera) -> Camera {
-    camera.resized((camera.width / 2).max(1), (camera.height / 2).max(1))
 }
 
 /// Default number of random points to start from.

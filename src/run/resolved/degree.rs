@@ -4,7 +4,7 @@ use std::ops::RangeInclusive;
 
 use super::inputs::Evidence;
 use super::sources::DegreeSource;
-use crate::spec::{InitChoice, RunSpec, ShDegree};
+use crate::spec::{Budget, InitChoice, RunSpec, ShDegree};
 use densify_core::gaussians::MAX_SH_DEGREE;
 use densify_core::numbers::grouped;
 use densify_data::track_colours::{self, MIN_TRACKS};
@@ -26,7 +26,8 @@ impl Degree {
     /// no given model has colours already.
     fn is_tried(spec: &RunSpec) -> bool {
         let has_model = matches!(spec.start.init, Some(InitChoice::Model(_)));
-        spec.size.memory.is_some() && !has_model && spec.start.freeze.is_none()
+        let is_auto_budget = spec.size.budget.is_some_and(Budget::is_auto);
+        spec.size.memory.is_some() && !is_auto_budget && !has_model && spec.start.freeze.is_none()
     }
 
     /// True if the colours of the tracks decide the degree.
@@ -71,7 +72,7 @@ impl Degree {
             // About trial runs that are to be made, see `trial.rs`.
             DegreeSource::Given | DegreeSource::Untried => None,
             DegreeSource::Trial(trial) => {
-                Some(format!("colour   degree {} (auto): {}", self.highest(), trial.describe()))
+                Some(format!("colour   degree {} (auto): {}", trial.degree(), trial.describe()))
             }
             DegreeSource::Spread(spread) => Some(format!(
                 "colour   degree {} (auto): the colour of a twentieth of {} points varies by {:.1}/255 or more \

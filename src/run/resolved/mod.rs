@@ -67,10 +67,7 @@ impl<'a> ResolvedRun<'a> {
         let case = Case::for_new_run(spec, host)?;
         let size = Size::choose(&case)?;
         let degree_lowered = size.is_lowered(&case);
-        let trial = case.trial_line(&size.run_size)?;
-        let mut run = Self::new(case, &size, degree_lowered, host);
-        run.reasons.extend(trial);
-        Ok(run)
+        Ok(Self::new(case, &size, degree_lowered, host))
     }
 
     /// Resolves a trial run. It has images of half the size, of which one in [`HELD_OUT`] is not trained on but tested.
@@ -80,7 +77,8 @@ impl<'a> ResolvedRun<'a> {
     pub(crate) fn for_trial(&'a self, spec: &'a RunSpec, host: Host<'_>) -> Result<Self, Failure> {
         let mut case = self.case.with(spec)?;
         case.halve_and_hold_out(HELD_OUT);
-        let size = Size::as_given(&case)?;
+        let mut size = Size::as_given(&case)?;
+        size.run_size.images_on_gpu = self.size.images_on_gpu;
         Ok(Self::new(case, &size, false, host))
     }
 

@@ -42,6 +42,7 @@ pub struct Alternatives {
 pub fn plan(spec: &RunSpec, host: Host<'_>) -> Result<Plan, Failure> {
     let ResolvedRun { case, size, mut reasons, .. } = ResolvedRun::for_new_run(spec, host)?;
     let ledger = case.ledger_of(&size)?;
+    reasons.extend(case.trial_line(&size)?);
     reasons.push(case.memory_table(&ledger, host.observer.spelling()));
     let limited = case.inputs.device.limited_bytes(&ledger);
     if case.memory().is_none() {

@@ -2,6 +2,7 @@
 
 use super::inputs::Evidence;
 use super::sources::PoseSource;
+use super::trial::halved;
 use crate::failure::notes;
 use crate::spec::RunSpec;
 use densify_core::camera::Camera;
@@ -47,11 +48,15 @@ impl RefinedPoses {
         Self { is_on, source, adjusted: if is_on && is_known { adjusted } else { Vec::new() } }
     }
 
-    /// Drops the adjusted cameras of all views but those that `keeps` names by their numbers, and changes these.
-    pub(super) fn keep(&mut self, keeps: impl Fn(usize) -> bool, change: fn(&Camera) -> Camera) {
+    /// Halves the images, and drops the adjusted cameras of all views but those that `keeps` names by their numbers.
+    pub(super) fn halve_and_keep(&mut self, keeps: impl Fn(usize) -> bool) {
         let numbered = self.adjusted.iter().enumerate();
         self.adjusted =
-            numbered.filter(|(view, _)| keeps(*view)).map(|(_, camera)| change(camera)).collect();
+            numbered.filter(|(view, _)| keeps(*view)).map(|(_, camera)| halved(camera)).collect();
+        // In pixels.
+        if let PoseSource::Tracks(errors) = &mut self.source {
+            errors.uncertainty *= 0.5;
+        }
     }
 
     /// The poses that the run starts with, if poses are refined.
@@ -103,5 +108,31 @@ impl RefinedPoses {
                 notes::refine_poses(spelling)
             )),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use glam::DMat3;
+
+    use super::*;
+
+    #[test]
+    fn adjusted_cameras_stay_with_their_views() {
+        let camera = |fx: f64| Camera {
+            width: 8,
+            height: 6,
+            fx,
+            fy: fx,
+            cx: 4.0,
+            cy: 3.0,
+            rotation: DMat3::IDENTITY,
+            translation: glam::DVec3::ZERO,
+        };
+        let mut poses = RefinedPoses::known(true, PoseSource::Undecided);
+        poses.adjusted = [10.0, 12.0, 14.0, 16.0].map(camera).to_vec();
+        poses.halve_and_keep(|view| view != 1);
+        let left: Vec<_> = poses.adjusted.iter().map(|camera| (camera.width, camera.fx)).collect();
+        assert_eq!(left, [(4, 5.0), (4, 7.0), (4, 8.0)]);
     }
 }

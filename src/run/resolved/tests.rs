@@ -129,6 +129,38 @@ fn unused_features_of_photographs_take_no_memory() {
     );
 }
 
+#[test]
+fn trial_runs_have_half_the_size_and_hold_out_every_eighth_view() {
+    let spec = described(&[("scene", "scene:spheres".into()), ("resolution", 4.into())]);
+    let mut case = Case::for_new_run(&spec, Host::default()).expect("a run");
+    let all = case.inputs.dataset.train.clone();
+    case.halve_and_hold_out(HELD_OUT);
+    let held_out = |view: usize| view % 8 == 7;
+    let dataset = &case.inputs.dataset;
+    for (views, is_held_out) in [(&dataset.train, false), (&dataset.test, true)] {
+        let expected = all.iter().enumerate().filter(|(view, _)| held_out(*view) == is_held_out);
+        let expected: Vec<_> =
+            expected.map(|(_, view)| (&view.name, view.camera.width / 2)).collect();
+        let found: Vec<_> = views.iter().map(|view| (&view.name, view.camera.width)).collect();
+        assert_eq!(found, expected);
+    }
+}
+
+#[test]
+fn the_lowest_degree_is_taken_from_a_clear_lead_on() {
+    let trial = |low: f64, high: f64| DegreeTrial {
+        iterations: 1_400,
+        highest: 2,
+        views: 5,
+        rows: [2_000, 1_000],
+        psnr: [low, high],
+    };
+    for (low, high, degree) in [(30.0, 28.0, 0), (30.0, 29.0, 2), (28.0, 30.0, 2)] {
+        assert_eq!(trial(low, high).degree(), degree);
+    }
+    assert_eq!(trial(f64::NAN, 30.0).degree(), 2, "a model that is not finite");
+}
+
 /// True after a case of the test below has run on a GPU.
 static ON_GPU: AtomicBool = AtomicBool::new(false);
 

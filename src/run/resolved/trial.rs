@@ -8,12 +8,15 @@
 use super::case::Case;
 use super::degree::Degree;
 use super::size::{Size, rows_at};
-use super::sources::{DegreeSource, DegreeTrial};
+use super::sources::{DegreeSource, DegreeTrial, VignetteSource};
+use super::vignette::CameraVignettes;
 use super::{ResolvedRun, RunSize};
 use crate::failure::Failure;
 use crate::host::Host;
 use crate::spec::{Budget, ImageCache, Rows, RunSpec, ShDegree, Whole};
+use densify_core::camera::Camera;
 use densify_core::numbers::grouped;
+use densify_data::dataset::View;
 
 /// A run is this many times as long as a trial run.
 const SHORTER: u32 = 5;
@@ -25,20 +28,31 @@ const MIN_ITERATIONS: u32 = 1_000;
 pub(super) const HELD_OUT: usize = 8;
 /// Fewest training views, so that two are held out.
 const MIN_VIEWS: usize = 2 * HELD_OUT;
+/// At the lowest degree, this many times as many rows must be possible at least.
+const MIN_RATIO: f64 = 1.25;
 /// Smallest width or height of the images of a trial run, whichever is larger `[px]`.
 const MIN_SIDE: u32 = 32;
 
 /// Why a run makes no trial runs, although memory decides its degree.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Obstacle {
+pub(crate) enum Obstacle {
     Iterations,
     Views,
     Images,
-    Rows,
+    Steps,
+    Budget,
     Memory,
 }
 
 impl Obstacle {
+    /// A line for the user about a run that takes `degree` therefore.
+    pub(crate) fn line(self, degree: u8) -> String {
+        format!(
+            "colour   degree {degree} (auto): not compared with degree 0, because {}",
+            self.reason()
+        )
+    }
+
     fn reason(self) -> String {
         match self {
             Self::Iterations => format!(
@@ -49,7 +63,8 @@ impl Obstacle {
             Self::Images => {
                 format!("trial runs take images that still have {MIN_SIDE} px at half the size")
             }
-            Self::Rows => "no more Gaussians would fit".to_owned(),
+            Self::Steps => "parameters of the policy are given in steps".to_owned(),
+            Self::Budget => "the budget allows hardly more Gaussians".to_owned(),
             Self::Memory => "the scene leaves too little memory for trial runs".to_owned(),
         }
     }
@@ -69,12 +84,12 @@ pub(crate) struct TrialRuns {
 }
 
 impl ResolvedRun<'_> {
-    /// The trial runs that decide the degree; `None` if nothing is to be decided.
+    /// The trial runs that decide the degree, or what prevents them; `None` if nothing is to be decided.
     ///
     /// # Errors
-    /// When a description contradicts itself.
-    pub(crate) fn trial_runs(&self) -> Result<Option<TrialRuns>, Failure> {
-        Ok(self.case.find_trial(&self.size)?.and_then(Result::ok))
+    /// When a size cannot be computed.
+    pub(crate) fn trial_runs(&self) -> Result<Option<Result<TrialRuns, Obstacle>>, Failure> {
+        self.case.find_trial(&self.size)
     }
 
     /// The same run with the degree that the trial runs decide.
@@ -83,8 +98,9 @@ impl ResolvedRun<'_> {
     /// When no model fits.
     pub(crate) fn decided_by(self, trial: DegreeTrial, host: Host<'_>) -> Result<Self, Failure> {
         let mut case = self.case;
-        case.choices.degree =
-            Degree { range: 0..=trial.degree(), source: DegreeSource::Trial(trial) };
+        // A degree that memory has lowered is lowered again.
+        let wanted = if trial.degree() == 0 { 0 } else { case.choices.degree.highest() };
+        case.choices.degree = Degree { range: 0..=wanted, source: DegreeSource::Trial(trial) };
         let size = Size::choose(&case)?;
         let degree_lowered = size.is_lowered(&case);
         Ok(Self::new(case, &size, degree_lowered, host))
@@ -92,7 +108,7 @@ impl ResolvedRun<'_> {
 }
 
 impl Case<'_> {
-    /// A line for the user if trial runs would decide the degree, or cannot.
+    /// A line of `densify plan` if trial runs would decide the degree, or cannot.
     pub(super) fn trial_line(&self, size: &RunSize) -> Result<Option<String>, Failure> {
         let degree = size.sh_degree;
         Ok(self.find_trial(size)?.map(|trial| match trial {
@@ -101,10 +117,7 @@ impl Case<'_> {
                  sizes here are for degree {degree}",
                 grouped(trial.iterations as usize)
             ),
-            Err(obstacle) => format!(
-                "colour   degree {degree} (auto): not compared with degree 0, because {}",
-                obstacle.reason()
-            ),
+            Err(obstacle) => obstacle.line(degree),
         }))
     }
 
@@ -131,8 +144,12 @@ impl Case<'_> {
         }
         let most = self.spec.size.budget.and_then(Budget::most).unwrap_or(usize::MAX);
         let lowest = rows_at(self, memory, 0, size.rows)?.unwrap_or(size.rows).min(most);
-        if lowest <= size.rows {
-            return Ok(Some(Err(Obstacle::Rows)));
+        if (lowest as f64) < MIN_RATIO * size.rows as f64 {
+            return Ok(Some(Err(Obstacle::Budget)));
+        }
+        let steps = self.choices.entry.step_parameters();
+        if steps.iter().any(|step| self.choices.parameters.contains_key(step.name())) {
+            return Ok(Some(Err(Obstacle::Steps)));
         }
         let (degrees, rows) = ([0, size.sh_degree], [lowest, size.rows].map(|rows| rows / SMALLER));
         let tile_cap = |rows: usize| rows.max(size.tile_cap / SMALLER);
@@ -158,4 +175,31 @@ impl Case<'_> {
         }
         Ok(Some(Ok(TrialRuns { iterations, highest: size.sh_degree, rows, specs })))
     }
+
+    /// Halves the images of the training views, makes one view of `every` a test view, and drops the other test views.
+    /// Vignettes, which belong to whole photographs, are not learned.
+    pub(super) fn halve_and_hold_out(&mut self, every: usize) {
+        let trains = |view: usize| !(view + 1).is_multiple_of(every);
+        let dataset = &mut self.inputs.to_mut().dataset;
+        let mut numbers = 0..;
+        let (train, test) = std::mem::take(&mut dataset.train)
+            .into_iter()
+            .partition(|_| numbers.next().is_some_and(trains));
+        (dataset.train, dataset.test) = (train, test);
+        for View { camera, source, .. } in dataset.train.iter_mut().chain(&mut dataset.test) {
+            *camera = halved(camera);
+            // Then images are shrunk when they are decoded; otherwise, whenever they are used.
+            if source.window.is_none() && source.depth.is_none() {
+                (source.width, source.height) = (camera.width, camera.height);
+            }
+        }
+        self.choices.exposure.keep(trains);
+        self.choices.poses.halve_and_keep(trains);
+        self.choices.vignette = CameraVignettes::known(false, VignetteSource::Given);
+    }
+}
+
+/// The camera with an image of half the size.
+pub(super) fn halved(camera: &Camera) -> Camera {
+    camera.resized((camera.width / 2).max(1), (camera.height / 2).max(1))
 }

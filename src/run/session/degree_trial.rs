@@ -13,31 +13,50 @@ use crate::observer::{Silent, check_interrupt};
 use crate::resolved::{DECODERS, DegreeTrial, ResolvedRun, TEST_DECODERS, TrialRuns};
 use crate::spec::RunSpec;
 use densify_core::numbers::grouped;
-use densify_data::dataset::View;
 use densify_data::views::{DatasetViews, ShrunkViews, ViewSource};
-use densify_train::evaluate::{Comparison, EvaluateError, evaluate};
-use densify_train::output::Mean;
+use densify_train::evaluate::{Comparison, ViewScore, evaluate};
 
-/// The run with its degree decided, and the time that this took; unchanged if trial runs have nothing to decide.
+/// The largest PSNR of a view `[dB]`: that of equal images is infinite.
+const MAX_PSNR: f64 = 100.0;
+
+/// The run with its degree decided, and the time that this took; unchanged if trial runs have nothing to decide, are
+/// prevented, or fail.
 ///
 /// # Errors
-/// When a view cannot be read, the device fails, or the observer asks to stop.
+/// When a size cannot be computed, or the observer asks to stop.
 pub(super) fn decide<'a>(
     run: ResolvedRun<'a>,
     host: Host<'_>,
 ) -> Result<(ResolvedRun<'a>, Option<Spent>), Failure> {
-    let Some(TrialRuns { iterations, highest, rows, specs }) = run.trial_runs()? else {
-        return Ok((run, None));
+    let observer = host.observer;
+    let TrialRuns { iterations, highest, rows, specs } = match run.trial_runs()? {
+        None => return Ok((run, None)),
+        Some(Err(obstacle)) => {
+            observer.say(format_args!("{}", obstacle.line(run.size.sh_degree)));
+            return Ok((run, None));
+        }
+        Some(Ok(runs)) => runs,
     };
     let (wall, cpu) = (Instant::now(), ProcessTime::try_now().ok());
-    host.observer.say(format_args!(
+    observer.say(format_args!(
         "colour   two trial runs of {} iterations compare degree 0 with degree {highest}",
         grouped(iterations as usize)
     ));
-    let [low, high] = &specs;
-    let ((low, views), (high, _)) = (measure(&run, low, host)?, measure(&run, high, host)?);
-    let trial = DegreeTrial { iterations, highest, views, rows, psnr: [low, high] };
-    let run = run.decided_by(trial, host)?;
+    let measured = specs.each_ref().map(|spec| measure(&run, spec, host));
+    check_interrupt(observer)?;
+    let run = match measured {
+        [Ok((low, views)), Ok((high, _))] if low.is_finite() && high.is_finite() => {
+            let trial = DegreeTrial { iterations, highest, views, rows, psnr: [low, high] };
+            run.decided_by(trial, host)?
+        }
+        measured => {
+            let failure = measured.into_iter().find_map(Result::err);
+            let reason = failure.map_or_else(|| "not finite".to_owned(), |why| why.to_string());
+            observer
+                .say(format_args!("note: a trial run failed, so degree {highest} stays: {reason}"));
+            run
+        }
+    };
     Ok((run, Some(Spent::since(wall, cpu))))
 }
 
@@ -46,16 +65,17 @@ fn measure(run: &ResolvedRun<'_>, spec: &RunSpec, host: Host<'_>) -> Result<(f64
     let trial = run.for_trial(spec, Host { observer: &Silent, ..host })?;
     let (model, training) = start(&trial, &Silent)?;
     let ResolvedRun { case, size, .. } = &trial;
-    let of_views = |views: &[View], cache: u64, decoders: usize| {
-        ShrunkViews(DatasetViews::new(views.to_vec(), cache, decoders))
-    };
-    let views = of_views(&case.inputs.dataset.train, size.image_cache, DECODERS);
-    let mut trainer = trainer(&trial, model, training, views, |_| Ok(()))?;
-    while trainer.steps_done() < spec.schedule.iterations.0 {
+    let dataset = &case.inputs.dataset;
+    let views = DatasetViews::new(dataset.train.clone(), size.image_cache, DECODERS);
+    views.check_visible(&dataset.root)?;
+    let mut trainer = trainer(&trial, model, training, ShrunkViews(views), |_| Ok(()))?;
+    let last = spec.schedule.iterations.0;
+    for step in 1..=last {
         check_interrupt(host.observer)?;
-        trainer.step()?;
+        let report = trainer.step()?;
+        host.observer.trial_step([step, last], report.output.loss, [report.rows, size.rows]);
     }
-    let views = of_views(&case.inputs.dataset.test, 0, TEST_DECODERS);
+    let views = ShrunkViews(DatasetViews::new(dataset.test.clone(), 0, TEST_DECODERS));
     let progress = trainer.progress();
     let (fits_exposure, fits_pose) = (progress.exposures.is_some(), progress.poses.is_some());
     let comparison = Comparison { lpips: None, fits_exposure, fits_pose };
@@ -64,9 +84,7 @@ fn measure(run: &ResolvedRun<'_>, spec: &RunSpec, host: Host<'_>) -> Result<(f64
     let scores = evaluate(backend, &views, background, size.sh_degree, comparison, |_| {
         host.observer.interrupt().map_or(ControlFlow::Continue(()), |_| ControlFlow::Break(()))
     });
-    if matches!(scores, Err(EvaluateError::Stopped)) {
-        check_interrupt(host.observer)?;
-    }
-    let mean = Mean::over(&scores?);
-    Ok((mean.fitted.map_or(mean.psnr, |fitted| fitted.psnr), views.count()))
+    let psnr = |score: &ViewScore| score.fitted.map_or(score.psnr, |fitted| fitted.psnr);
+    let sum: f64 = scores?.iter().map(|score| psnr(score).min(MAX_PSNR)).sum();
+    Ok((sum / views.count() as f64, views.count()))
 }

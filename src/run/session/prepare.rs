@@ -37,16 +37,20 @@ pub(super) fn prepare(
     spec.check_iterations(last)?;
     let output = spec.output_folder()?;
     let checkpoint = resumed.as_ref().and_then(|resumed| resumed.checkpoint.as_ref());
-    let (run, spent) = match &resumed {
-        None => degree_trial::decide(ResolvedRun::for_new_run(spec, host)?, host)?,
+    let run = match &resumed {
+        None => ResolvedRun::for_new_run(spec, host)?,
         Some(resumed) => {
-            (ResolvedRun::from_saved(spec, &resumed.config, checkpoint.is_some(), host)?, None)
+            ResolvedRun::from_saved(spec, &resumed.config, checkpoint.is_some(), host)?
         }
     };
     if !spec.output.test_iterations.is_empty() && run.case.inputs.dataset.test.is_empty() {
         return Err(OptionProblem::NothingToTest.into());
     }
     run.check_grant(process, resumed.is_some())?;
+    let (run, spent) = match resumed {
+        None => degree_trial::decide(run, host)?,
+        Some(_) => (run, None),
+    };
     let (model, training) = match checkpoint {
         None => start(&run, observer)?,
         Some(checkpoint) => {

@@ -22,6 +22,9 @@ pub(super) struct Totals {
     pub(super) wall: Duration,
     /// Processor time of the same, if the system measures it.
     pub(super) cpu: Option<Duration>,
+    /// Processor time of the trial runs alone.
+    #[serde(default, skip_serializing_if = "Duration::is_zero")]
+    cpu_of_trials: Duration,
     /// Wall time by stage.
     pub(super) stages: BTreeMap<String, Duration>,
     /// For each of the last steps, as many as there are training views: true if anything was rendered.
@@ -64,10 +67,19 @@ struct Window {
 
 impl Totals {
     /// The totals of a run that begins, after the time that was spent before its first step.
-    pub(super) fn after(spent: Option<Spent>) -> Self {
+    pub(super) fn after(trials: Option<Spent>) -> Self {
         let mut totals = Self { cpu: Some(Duration::ZERO), ..Self::default() };
-        totals.add(spent.unwrap_or(Spent { wall: Duration::ZERO, cpu: Some(Duration::ZERO) }));
+        if let Some(trials) = trials {
+            totals.add(trials);
+            totals.stage("trial runs", trials.wall);
+            totals.cpu_of_trials = trials.cpu.unwrap_or_default();
+        }
         totals
+    }
+
+    /// Processor time of all steps, if the system measures it.
+    pub(super) fn cpu_of_steps(&self) -> Option<Duration> {
+        self.cpu.map(|cpu| cpu.saturating_sub(self.cpu_of_trials))
     }
 
     pub(super) fn add(&mut self, spent: Spent) {

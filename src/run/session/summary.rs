@@ -96,7 +96,7 @@ impl Session<'_> {
             let peak = Bytes(peak);
             self.observer.say(format_args!("memory   {peak} at its peak, {promised} promised"));
         }
-        let cpu = self.totals.cpu.map_or_else(String::new, |cpu| {
+        let cpu = self.totals.cpu_of_steps().map_or_else(String::new, |cpu| {
             format!(", {:.4} CPU-seconds per iteration", cpu.as_secs_f64() / f64::from(steps))
         });
         self.observer.say(format_args!("time     {}{cpu}", duration(self.totals.wall)));

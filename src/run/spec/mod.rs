@@ -282,8 +282,9 @@ run_spec! {
         /// Dependence of colours on the viewing direction: 0 none, 3 most; auto: as much as the scene requires
         /// (default: 3, or lower if --memory requires it)
         ///
-        /// Within --memory, auto makes two short trial runs and takes 0 if the Gaussians that then fit are worth more
-        /// than view-dependent colours. Otherwise it is decided by how much the photographs disagree about the colours
+        /// Within --memory, auto makes two short trial runs if the run has 5,000 iterations or more, and takes 0 if the
+        /// Gaussians that then fit are worth more than view-dependent colours, else 3. Without it, or with --init,
+        /// --freeze or --budget auto, it is decided by how much the photographs disagree about the colours
         /// of the reconstruction's points; with too few points, it is 3
         sh_degree: Option<ShDegree> = None, Fixed, value "DEGREE";
 

@@ -191,7 +191,12 @@ fn what_prevents_trial_runs_is_said() {
         ("scene:spheres", "--memory 90MiB -i 5000 -r 2", "degree 3 or 0 (auto): two trial runs of"),
         ("scene:spheres", "--memory 90MiB -i 4999 -r 2", "at least 5,000 iterations"),
         ("scene:spheres", "--memory 90MiB -i 5000 -r 4", "still have 32 px at half the size"),
-        ("scene:spheres", "--memory 90MiB -i 5000 -r 2 -b 2k", "no more Gaussians would fit"),
+        ("scene:spheres", "--memory 90MiB -i 5000 -r 2 -b 2k", "the budget allows hardly more"),
+        (
+            "scene:spheres",
+            "--memory 90MiB -i 5000 -r 2 --policy-set diet.grow_until=900",
+            "in steps",
+        ),
         (few, "--memory 90MiB -i 5000", "at least 16 training views"),
     ] {
         let planned = call(&format!("plan {scene} --backend cpu --sh-degree auto {flags}")).ok();

@@ -282,11 +282,11 @@ impl V<Scalar> {
     }
 }
 
-/// The sum over the lanes of each of four vectors. With four lanes or more they are reduced
-/// together, which takes half the operations.
+/// The sum over the lanes of each of four vectors. With eight lanes or more they are reduced together, which takes half
+/// the operations. With four, `pulp` puts lanes in another order, and each vector is summed in two instructions.
 #[inline(always)]
 pub(super) fn sums_of_four<S: Simd>([a, b, c, d]: [V<S>; 4]) -> [f32; 4] {
-    if S::F32_LANES < 4 {
+    if S::F32_LANES < 8 {
         return [a.sum(), b.sum(), c.sum(), d.sum()];
     }
     let s = a.s;
@@ -298,8 +298,7 @@ pub(super) fn sums_of_four<S: Simd>([a, b, c, d]: [V<S>; 4]) -> [f32; 4] {
     for (k, sum) in sums.iter_mut().enumerate() {
         *sum = match S::F32_LANES {
             16 => (lanes[k] + lanes[4 + k]) + (lanes[8 + k] + lanes[12 + k]),
-            8 => lanes[k] + lanes[4 + k],
-            _ => lanes[k],
+            _ => lanes[k] + lanes[4 + k],
         };
     }
     sums
