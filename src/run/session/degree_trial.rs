@@ -42,18 +42,24 @@ pub(super) fn decide<'a>(
         "colour   two trial runs of {} iterations compare degree 0 with degree {highest}",
         grouped(iterations as usize)
     ));
-    let measured = specs.each_ref().map(|spec| measure(&run, spec, host));
+    let [low, high] = &specs;
+    // A failure of the first makes the second pointless.
+    let measured = measure(&run, low, host).and_then(|low| Ok((low, measure(&run, high, host)?)));
     check_interrupt(observer)?;
+    let keeps = |reason: &dyn std::fmt::Display| {
+        observer.say(format_args!("note: a trial run failed, so degree {highest} stays: {reason}"));
+    };
     let run = match measured {
-        [Ok((low, views)), Ok((high, _))] if low.is_finite() && high.is_finite() => {
+        Ok(((low, views), (high, _))) if low.is_finite() && high.is_finite() => {
             let trial = DegreeTrial { iterations, highest, views, rows, psnr: [low, high] };
             run.decided_by(trial, host)?
         }
-        measured => {
-            let failure = measured.into_iter().find_map(Result::err);
-            let reason = failure.map_or_else(|| "not finite".to_owned(), |why| why.to_string());
-            observer
-                .say(format_args!("note: a trial run failed, so degree {highest} stays: {reason}"));
+        Ok(_) => {
+            keeps(&"not finite");
+            run
+        }
+        Err(failure) => {
+            keeps(&failure);
             run
         }
     };
