@@ -18,7 +18,8 @@ pub enum Purpose {
     Draw = 4,
     /// Stochastic rounding of numbers stored in fewer bits.
     Round = 5,
-    /// Numbers that a policy in another language draws for its own ends; the counter is that of the call.
+    /// Numbers that a policy written in Python draws for its own ends; the counter is the number of the call in the
+    /// event.
     Own = 6,
 }
 

@@ -1,4 +1,4 @@
-"""The command: the same program as that of ``cargo install``, with Python policies."""
+"""The ``densify`` command: the program that ``cargo install`` builds, and policies written in Python."""
 
 from __future__ import annotations
 

@@ -5,10 +5,11 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from . import _densify, _policy
-from ._errors import Interrupted
+from ._errors import DensifyError, Interrupted
 from ._progress import Listener
 from ._run import Run
 from ._scenes import Camera, Dataset, Model, Rendering, StrPath, colour_of
@@ -91,17 +92,22 @@ def train(
 
 
 def prepare(
-    scene: Scene,
+    scene: Scene | None = None,
     *,
     policy: PolicyLike | None = None,
     output: StrPath | None = None,
+    resume: bool = False,
     progress: bool = False,
     **options: Unpack[Options],
 ) -> Trainer:
-    """Prepares a run to step through; nothing is written."""
+    """Prepares a run to step through. Nothing is written before ``save_checkpoint`` or ``finish``.
+
+    ``resume=True`` continues the run in ``output`` from its last checkpoint.
+    """
     _policy.check_not_importing()
-    core = _densify.prepare(table_of(scene, policy, output, options), listener=Listener(progress))
-    return Trainer._of(core, scene if isinstance(scene, Dataset) else None)
+    table = table_of(scene, policy, output, options)
+    core = _densify.prepare(table, resume=resume, listener=Listener(progress))
+    return Trainer._of(core, scene if isinstance(scene, Dataset) else None, output is not None)
 
 
 def plan(
@@ -115,19 +121,25 @@ def plan(
 
 
 class Trainer:
-    """A prepared run. ``for step in trainer`` trains it to its end."""
+    """A prepared run. ``for step in trainer`` trains it to its end.
+
+    Ctrl-C raises Interrupted between two steps; if ``output`` was given, it writes a checkpoint first. The loop can be
+    entered again.
+    """
 
     _core: _densify.TrainerCore
     _stop: _densify.Stop
     _dataset: Dataset | None
+    _has_output: bool
 
     def __init__(self) -> None:
         raise TypeError("densify.prepare(…) makes trainers")
 
     @classmethod
-    def _of(cls, core: _densify.TrainerCore, dataset: Dataset | None) -> Trainer:
+    def _of(cls, core: _densify.TrainerCore, dataset: Dataset | None, has_output: bool) -> Trainer:
         trainer = cls.__new__(cls)
-        trainer._core, trainer._dataset, trainer._stop = core, dataset, _densify.Stop()
+        trainer._core, trainer._dataset, trainer._has_output = core, dataset, has_output
+        trainer._stop = _densify.Stop()
         return trainer
 
     def step(self) -> Step:
@@ -145,12 +157,27 @@ class Trainer:
             yield self.step()
 
     def _interrupt(self) -> NoReturn:
+        by_signal = self._stop.by_signal
         self._stop.clear()
-        raise Interrupted(f"stopped after step {self.steps_done}")
+        message = f"stopped after step {self.steps_done}"
+        if by_signal and self._has_output:
+            try:
+                message += f"; resume=True continues from the checkpoint in {self.save_checkpoint()}"
+            except DensifyError as error:
+                message += f"; no checkpoint was written: {error}"
+        raise Interrupted(message)
 
     def stop(self) -> None:
         """Ends the loop over this trainer before its next step; other threads may call it."""
         self._stop.ask()
+
+    def save_checkpoint(self) -> Path:
+        """Writes a checkpoint into the output folder, which is returned; training can go on here.
+
+        ``prepare(output=…, resume=True)``, ``train(output=…, resume=True)`` and ``densify train --resume`` continue from
+        it, and end with the same bytes.
+        """
+        return Path(self._core.save_checkpoint())
 
     def finish(self, *, overwrite: bool = False, progress: bool = True) -> Run:
         """Trains to the end and writes all files of the run, as ``train`` does."""

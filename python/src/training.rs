@@ -62,20 +62,23 @@ pub(crate) fn train(
     })
 }
 
-/// Prepares a run, and writes nothing.
+/// Prepares a run, or one to resume, and writes nothing.
 #[pyfunction]
-#[pyo3(signature = (options, *, listener))]
+#[pyo3(signature = (options, *, resume, listener))]
 pub(crate) fn prepare(
     py: Python<'_>,
     options: &str,
+    resume: bool,
     listener: &Bound<'_, PyAny>,
 ) -> PyResult<TrainerCore> {
     Listener::new(Some(listener), None)?.follow(py, |follower| {
-        let spec = options::spec(options)?;
+        let given = options::partial(options)?;
+        let (spec, resumed) =
+            if resume { start(given, follower)? } else { (given.describe()?, None) };
         restart_peak();
-        let run = Run::prepare_on(&spec, None, Host::new(follower))?;
-        let (last, ledger) = (spec.schedule.iterations.0, run.ledger.clone());
-        let state = State { run: Some(Box::new(run)), over: None };
+        let run = Run::prepare_on(&spec, resumed, Host::new(follower))?;
+        let (last, ledger) = (run.last, run.ledger.clone());
+        let state = State { run: Some(Box::new(run)), continues: resume, over: None };
         Ok(TrainerCore { state: Mutex::new(state), spec, last, ledger })
     })
 }
@@ -84,6 +87,8 @@ pub(crate) fn prepare(
 struct State {
     /// `None` once the run was trained to the end.
     run: Option<Box<Run>>,
+    /// True if the files in the output folder are this run's own.
+    continues: bool,
     /// The reason why there are no more steps, if a step has failed or the run was trained to the end.
     over: Option<&'static str>,
 }
@@ -192,20 +197,37 @@ impl TrainerCore {
         listener: &Bound<'_, PyAny>,
         stop: &Bound<'_, Stop>,
     ) -> PyResult<PathBuf> {
-        let occupied = occupied(false, overwrite).map_err(|failure| raise(py, &failure))?;
         let folder = self.spec.output_folder().map_err(|failure| raise(py, &failure))?;
-        detached(py, || Ok(RunFolder::check(&folder, overwrite)?))?;
         let listener = Listener::new(Some(listener), Some(stop))?;
-        let taken = {
+        let (run, occupied) = {
             let mut state = self.lock()?;
             if let Some(why) = state.over {
                 return Err(over(why));
             }
+            let continues = state.continues;
+            let occupied = occupied(continues, overwrite).map_err(|failure| raise(py, &failure))?;
+            let run = state.run()?;
+            detached(py, move || {
+                RunFolder::check(&folder, continues || overwrite)?;
+                run.check_continued()
+            })?;
             state.over = Some(FINISHED);
-            state.run.take()
+            (state.run.take(), occupied)
         };
-        let run = taken.ok_or_else(|| over(FINISHED))?;
+        let run = run.ok_or_else(|| over(FINISHED))?;
         listener.follow(py, |follower: &Follower| run.train(occupied, follower))
+    }
+
+    /// Writes a checkpoint into the output folder; returns the folder.
+    fn save_checkpoint(&self, py: Python<'_>) -> PyResult<PathBuf> {
+        let mut state = self.lock()?;
+        if let Some(why) = state.over {
+            return Err(over(why));
+        }
+        let run = state.run()?;
+        let folder = detached(py, move || run.save_checkpoint())?;
+        state.continues = true;
+        Ok(folder)
     }
 
     /// The model in the dataset's own coordinates.

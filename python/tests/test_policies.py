@@ -356,6 +356,21 @@ def test_a_run_is_the_same_in_another_process(scene: Path, tmp_path: Path) -> No
         assert done.returncode == 2 and message in done.stderr, done.stderr
 
 
+def test_trade_measures_knobs_under_a_python_policy(scene: Path, tmp_path: Path) -> None:
+    study = ["trade", str(scene), "--knobs", "alpha_min:1/64", "--seeds", "1", "-i", "30", "-b", "220"]
+    options = ["--policy", "steady", "--policy-file", str(EXAMPLES / "steady.py"), "--init", "random"]
+    done = subprocess.run(
+        [sys.executable, "-m", "densify", *study, "-o", str(tmp_path / "trade"), "--", *options, "--test-every", "3"],
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0 and "alpha_min" in done.stdout, done.stdout + done.stderr
+    runs = [json.loads(line) for line in (tmp_path / "trade" / "trade.jsonl").read_text().splitlines()]
+    assert len(runs) == 2 and (tmp_path / "trade" / "trade.html").is_file()
+    (config, *_) = (tmp_path / "trade").rglob("config.toml")
+    assert 'policy = "steady"' in config.read_text()
+
+
 def test_the_plug_in_of_pytest_runs_the_conformance_suite(tmp_path: Path) -> None:
     def run(*words: str) -> subprocess.CompletedProcess[str]:
         command = [sys.executable, "-m", "pytest", "-q", str(tmp_path), *words]

@@ -215,6 +215,61 @@ def test_ctrl_c_while_a_trainer_is_stepped(scene: Path) -> None:
     assert signal.getsignal(signal.SIGINT) is before
 
 
+def test_a_stepped_run_is_saved_and_resumed(scene: Path, tmp_path: Path) -> None:
+    model = "point_cloud/iteration_60/point_cloud.ply"
+    whole = densify.train(scene, output=tmp_path / "whole", progress=False, **SMALL)
+    folder = tmp_path / "run"
+    trainer = densify.prepare(scene, output=folder, **SMALL)
+    for step in trainer:
+        if step.step in (17, 25):
+            assert trainer.save_checkpoint() == folder == trainer.save_checkpoint()
+        if step.step == 30:
+            break
+    # Step 30 is not saved: the resumed run does steps 26 to 30 again.
+    shutil.copytree(folder, tmp_path / "copy")
+    resumed = densify.prepare(output=folder, resume=True)
+    assert resumed.steps_done == 25 and resumed.iterations == 60
+    assert [step.step for step in resumed] == list(range(26, 61))
+    assert (resumed.model().means == whole.model().means).all()
+    assert resumed.finish(progress=False).folder == folder
+    assert (folder / model).read_bytes() == (whole.folder / model).read_bytes()
+    # The first trainer would overwrite what the second one has done.
+    for use in (trainer.save_checkpoint, lambda: trainer.finish(progress=False)):
+        with pytest.raises(densify.InputError, match="another program has continued.* resume=True"):
+            use()
+    # A whole run and the command continue as well, and a saved trainer ends in its own folder.
+    run = densify.train(output=tmp_path / "copy", resume=True, progress=False)
+    assert (run.folder / model).read_bytes() == (whole.folder / model).read_bytes()
+    third = densify.prepare(scene, output=tmp_path / "third", **SMALL)
+    third.step()
+    third.save_checkpoint()
+    third.step()
+    run = third.finish(progress=False)
+    assert (run.folder / model).read_bytes() == (whole.folder / model).read_bytes()
+    # Another run, and a folder that cannot be made, stay as they are; the trainer is not lost.
+    before = sorted(path.name for path in whole.folder.iterdir())
+    (tmp_path / "file").touch()
+    for output, words in ((whole.folder, "another run"), (tmp_path / "file" / "run", "file")):
+        other = densify.prepare(scene, output=output, **SMALL)
+        with pytest.raises(densify.DensifyError, match=words):
+            other.save_checkpoint()
+        assert other.step().step == 1
+    assert sorted(path.name for path in whole.folder.iterdir()) == before
+
+
+@not_on_windows
+def test_ctrl_c_in_a_loop_writes_a_checkpoint(scene: Path, tmp_path: Path) -> None:
+    from .made import make
+
+    def plan(now: densify.Now, rng: densify.Rng, plan: densify.Plan) -> None:
+        os.kill(os.getpid(), signal.SIGINT)
+
+    trainer = densify.prepare(scene, policy=make("interrupts", plan), output=tmp_path / "run", **SMALL)
+    with pytest.raises(densify.Interrupted, match="step 10; resume=True continues from the checkpoint in .*run"):
+        list(trainer)
+    assert densify.prepare(output=tmp_path / "run", resume=True).steps_done == 10
+
+
 def test_ctrl_c_while_a_run_is_measured(run: densify.Run) -> None:
     from densify import _densify, _opened, _progress
 

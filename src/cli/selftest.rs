@@ -15,9 +15,9 @@ use densify_selftest::{Case, Finding, Subject, SubjectReport, cases, markdown, t
 
 /// Compares this machine with a float64 renderer in numerically hard cases.
 ///
-/// Needles, thousands of layers, saturated opacities, images of one pixel, Gaussians with NaN: images,
-/// gradients, losses and optimiser steps are compared with those of a second renderer, which
-/// shares no arithmetic with the first. Prints the largest error of each kind, its place and its
+/// Among the cases are needle-shaped Gaussians, thousands of layers, saturated opacities, images of
+/// one pixel and Gaussians with NaN. Images, gradients, losses and optimiser steps are compared with
+/// those of a second renderer, which shares no arithmetic with the first. Prints the largest error of each kind, its place and its
 /// tolerance. Include this table in a bug report.
 ///
 /// The exit code is 1 if any figure is beyond its tolerance.
@@ -127,7 +127,7 @@ fn select_cases(only: &[u8]) -> Result<Vec<Case>, Failure> {
     if let Some(unknown) = only.iter().find(|number| !numbers.contains(number)) {
         let numbers: Vec<String> = numbers.iter().map(u8::to_string).collect();
         return Err(Failure::input(format!(
-            "there is no case {unknown}; there are {}",
+            "there is no case {unknown}; the cases are {}",
             numbers.join(", ")
         )));
     }

@@ -4,9 +4,10 @@ use densify_policies::policy::{AuxColumn, AuxRequest};
 
 use densify_render::AuxOutput;
 
-/// Usual distance from the surface above which a Gaussian is in front of it, as a fraction of the surface's depth.
+/// Default margin: a Gaussian is in front of the surface if it is nearer by more than this fraction of the surface's
+/// depth.
 pub const MARGIN: f32 = 0.05;
-/// Share of its weight in front of the surface above which a Gaussian is a floater.
+/// A Gaussian is a floater if more than this share of its weight is in front of the surface.
 const MOSTLY: f64 = 0.5;
 
 /// Blend weights α·T of a Gaussian, summed over the pixels of all measured views.
@@ -30,8 +31,8 @@ impl RowWeights {
     }
 }
 
-/// The measurements in each view; `margin`: distance from the surface above which a Gaussian is in front of it, as a
-/// fraction of the surface's depth, in `0..1`.
+/// The measurements in each view; `margin`, in `0..1`: a Gaussian is in front of the surface if it is nearer by more
+/// than this fraction of the surface's depth.
 pub fn request(margin: f32) -> AuxRequest {
     let columns = vec![AuxColumn::WeightInFront, AuxColumn::WeightSum];
     AuxRequest { columns, margin, ..AuxRequest::default() }

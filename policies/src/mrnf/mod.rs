@@ -12,9 +12,9 @@
 //!
 //! 1. Gaussians less opaque than `min_opacity` are pruned. Each is **replaced** by a child of a Gaussian that was seen
 //!    since the last event, drawn without replacement in proportion to opacity.
-//! 2. Until `grow_until` the model **grows**. Candidates are Gaussians with a score of at least `tau`. The share `growth` of
-//!    them is drawn without replacement in proportion to their scores, but at each event at most such a part of the
-//!    free budget that it would be used up at `grow_until` by equal steps.
+//! 2. Until `grow_until` the model **grows**. Candidates are Gaussians with a score above `tau`. The share `growth` of
+//!    them is drawn without replacement in proportion to their scores, but at most the free budget divided by the number
+//!    of events that are left until `grow_until`.
 //! 3. Parents, also those of replacements, are split along their longest axis: with d = `split_share`, two halves are
 //!    placed at ±3d standard deviations, their longest axis 1 − d times the parent's, the others √(1 − d²) times, their
 //!    opacity `child_opacity` times the parent's.
@@ -40,23 +40,24 @@
 //! ## Differences from the published method
 //!
 //! - Errors of several views are averaged; the published code takes the largest. Its error is that of contrast and
-//!   structure, without luminance, divided by its mean over the view; ours is 1 − SSIM. `tau` is the published threshold,
-//!   but of another scale: nearly every Gaussian that is seen is a candidate. So are most in the published run of bonsai,
-//!   which grows from 206,613 to 1,830,000 Gaussians in 7,000 steps; these rules give 2,080,000 if all are.
-//! - Edges weight the pixels of the error; the published code has a separate score of edges per Gaussian, which also
+//!   structure, without luminance, divided by its mean over the view; ours is 1 − SSIM. `tau` has the published value,
+//!   but the score has another scale: nearly every Gaussian that is seen is a candidate. In the published run of bonsai
+//!   most are candidates, too: it grows from 206,613 to 1,830,000 Gaussians in 7,000 steps, and these rules would give
+//!   2,080,000 if all were.
+//! - Here each pixel's error is weighted by its edge strength; the published code has a separate score of edges per Gaussian, which also
 //!   weights the draw of replacements, and a second factor for ridges.
 //! - The share of the screen that a Gaussian covers is not limited. The published code shrinks those that cover more
 //!   than 0.587 and splits them first.
-//! - Far Gaussians and far points get no share of the growth of their own.
+//! - No share of the growth is reserved for far Gaussians and far points.
 //! - The published noise is (1 − o)¹⁵⁰ · 50 · λ · ξ for Gaussians in view; here it has the shape of the covariance and
 //!   applies to all. Both agree for Gaussians of a hundredth of the camera radius.
 //! - The published learning rate of the means, 2.18e-5 falling to 2e-7, is in units of the median extent of the points.
 //!   Policies only know the scene extent, which is half of it in bonsai; hence the factor of two.
-//! - Rules of the published trainer that are no density control are not part of this policy: a loss of edges, 0.22
+//! - Rules of the published trainer that are no density control are not part of this policy: an edge loss, 0.22
 //!   instead of 0.2 as the weight of SSIM, terms for flat Gaussians and for colours, a model of exposures.
 //! - The published code has 175 events 163 steps apart. In a short run an event stands for m of them: its growth is
-//!   (1 + `growth`)ᵐ − 1, at most all candidates, and its decay m times as large, but at most five times as large per
-//!   optimiser step.
+//!   (1 + `growth`)ᵐ − 1, at most all candidates, and its decay is that of m events, but per
+//!   optimiser step at most five times the published one.
 //!
 //! ## Parameters
 //!

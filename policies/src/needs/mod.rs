@@ -34,7 +34,8 @@ pub struct Needs {
     pub candidates: Option<CandidateRequest>,
     /// Measurements in [auxiliary views](crate::policy::DensityPolicy::observe), if any.
     pub aux: Option<AuxRequest>,
-    /// The pixel term of the image loss. With [`PixelLoss::Huber`], short runs also take larger steps.
+    /// The pixel term of the image loss. With [`PixelLoss::Huber`], the learning rates of short runs are
+    /// also larger.
     pub pixel_loss: PixelLoss,
     /// Terms added to the training loss; the policy may [vary](crate::policy::DensityPolicy::loss_terms) them
     /// by step.
@@ -59,9 +60,9 @@ pub struct Needs {
     /// are set or change separately for each axis ([`ScaleRule::Axes`](crate::plan::ScaleRule::Axes)).
     pub detailed_edits: bool,
     /// Memory that the policy itself takes at an event, beyond the values that every policy derives from its signals:
-    /// copies for another language `[bytes per row]`.
+    /// the copies that a policy written in Python works on `[bytes per row]`.
     pub scratch_bytes: usize,
-    /// True if the policy copies candidates and the points of auxiliary views, as one in another language does.
+    /// True if the policy copies candidates and the points of auxiliary views, as policies written in Python do.
     pub copies_points: bool,
 }
 

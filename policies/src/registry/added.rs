@@ -26,7 +26,8 @@ pub trait PolicyFactory: Send + Sync {
     /// The reason why a value does not fit.
     fn typed(&self, table: Table) -> Result<Table, String>;
 
-    /// Converts parameters to their types, with [decisions](super::ConfiguredPolicy::decided) for this scene.
+    /// Converts parameters to their types, and [decides](super::ConfiguredPolicy::decided) those that are left to the
+    /// scene.
     ///
     /// # Errors
     /// As [`typed`](Self::typed).
@@ -34,13 +35,13 @@ pub trait PolicyFactory: Send + Sync {
         self.typed(table)
     }
 
-    /// Builds a policy from a value for every parameter, which [`decided`](Self::decided) has returned.
+    /// Builds a policy from the result of [`decided`](Self::decided), which has a value for every parameter.
     ///
     /// # Errors
     /// [`PolicyError::BadParameter`] when a value is out of range; any other error of the policy.
     fn build(&self, table: Table, scene: &SceneInfo) -> PolicyResult<Box<dyn DensityPolicy>>;
 
-    /// What decisions depend on besides this version of densify: the version of an interpreter, the checksum of a file.
+    /// What the policy's edits depend on besides this version of densify: the version of an interpreter, the checksum of a file.
     /// `None` for policies that are compiled with densify.
     fn provenance(&self) -> Option<String> {
         None
@@ -70,8 +71,8 @@ struct Added {
 
 static ADDED: RwLock<Vec<Added>> = RwLock::new(Vec::new());
 
-/// Adds a policy. It replaces one that was added with the same name and `identity`, such as the module and the name of
-/// a class: a notebook may define it again.
+/// Adds a policy, in place of one that was added with the same name and `identity` (for example, the module and name of
+/// a class), since a notebook may define a class again.
 ///
 /// # Errors
 /// [`PolicyError::DuplicateName`] when another policy has this name.

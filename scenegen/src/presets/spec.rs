@@ -37,7 +37,7 @@ impl FromStr for PresetSpec {
         let size = match (size, preset.build) {
             (None, _) => None,
             (Some(_), Build::Fixed(_)) => {
-                let problem = format!("the preset {name} has a fixed size; write {name}");
+                let problem = format!("the preset {name} has a fixed size; use {name}");
                 return Err(Error::Input(format!("{text}: {problem}")));
             }
             (Some(size), Build::Sized { default, largest, .. }) => {
@@ -45,7 +45,7 @@ impl FromStr for PresetSpec {
                     Some(size) => Some(size).filter(|&size| size != default),
                     None => {
                         return Err(Error::Input(format!(
-                            "{text}: {size:?} is not a size of the preset {name}; write {name}:1 to {name}:{largest}"
+                            "{text}: {size:?} is not a size of the preset {name}; use one from {name}:1 to {name}:{largest}"
                         )));
                     }
                 }

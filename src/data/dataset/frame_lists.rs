@@ -124,7 +124,7 @@ impl FrameLists {
         note(&self.validation, "are held out for validation: neither trained on nor tested");
         note(
             &self.both,
-            "are listed for training and for tests, so their scores are not those of new views",
+            "are listed both for training and for tests, so their scores do not measure unseen views",
         );
         if self.lists[0].is_some() && !self.names_any(1) && !self.names_any(2) {
             notes.push(format!(

@@ -187,8 +187,8 @@ fn check(
             && (depths[0] - depths[1]).abs() <= LOSS_TOLERANCE;
         if !is_close || found.visible != expected.visible {
             return Err(wrong(format!(
-                "at step {} of a test scene, loss {} and {} with {} rows on screen instead of {} and {} \
-                 with {}",
+                "at step {} of a test scene: loss {}, depth term {}, {} rows on screen; expected: loss {}, depth term \
+                 {}, {} rows",
                 step + 1,
                 found.loss,
                 depths[0],

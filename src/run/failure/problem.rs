@@ -124,6 +124,8 @@ pub enum ResumeProblem {
     NoSoundCheckpoint { output: PathBuf, errors: Vec<String> },
     /// A run has saved models, but no checkpoint.
     NoCheckpoint { output: PathBuf },
+    /// A run was saved or resumed here, and another process has continued it since.
+    Continued { output: PathBuf },
     /// Options would change the result of a resumed run.
     ResultWouldDiffer { origin: PathBuf, differences: Vec<Difference> },
     /// A run is resumed with another dataset.

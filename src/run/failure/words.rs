@@ -423,6 +423,11 @@ impl ResumeProblem {
                  give {overwrite}, or choose another folder with {folder}",
                 output.display()
             ),
+            Self::Continued { output } => format!(
+                "another program has continued or removed the run in {} since this one was saved there; {resume} \
+                 continues that run, and {folder} names another folder",
+                output.display()
+            ),
             Self::ResultWouldDiffer { origin, differences } => {
                 let shown = |value: &Option<String>| value.clone().unwrap_or("not set".to_owned());
                 let line = |difference: &Difference| {

@@ -1,6 +1,7 @@
 //! The session of a run: the loop around the trainer with its progress, logs, saved models, measurements and
 //! checkpoints. The file is not split because all of this happens between two steps, and the order matters.
 
+mod checkpoint;
 mod coordinates;
 mod degree_trial;
 mod first_model;
@@ -25,10 +26,11 @@ use glam::DVec3;
 
 use crate::failure::{Failure, INPUT, OTHER, TrainingProblem};
 use crate::observer::{Interrupt, NextAction, Observer, say_notes};
+use checkpoint::{Opened, open, write_state};
 use densify_core::files::{FileError, write_atomically};
 use densify_data::models::{PLY, Shape};
 use densify_data::views::ViewSource;
-use densify_train::checkpoint::{CheckpointError, Header, checkpoint_path, remove_older, write};
+use densify_train::checkpoint::{CheckpointError, checkpoint_path};
 use densify_train::evaluate::{Comparison, EvaluateError, Split, evaluate};
 use densify_train::exposure::named_transforms;
 use densify_train::output::{
@@ -59,8 +61,6 @@ struct Session<'a> {
     totals: Totals,
     /// Detects that another run has taken over the folder.
     guard: Guard,
-    /// Step of the last checkpoint that this process has written or resumed from.
-    checkpoint: Option<u32>,
     /// True if the user has been told about the coordinates of saved models.
     has_told_coordinates: bool,
 }
@@ -123,7 +123,7 @@ fn train(run: Run, if_exists: Occupied, observer: &dyn Observer) -> Result<PathB
         Err(failure) => {
             let _ = session.write_summary(false);
             let scene = session.run.spec.start.scene.clone().unwrap_or_default();
-            let kept = session.checkpoint;
+            let kept = session.run.checkpoint;
             drop(session);
             let run = folder.abandon();
             let checkpoint = kept.map(|step| checkpoint_path(&run, step));
@@ -163,34 +163,14 @@ impl<'a> Session<'a> {
     ) -> Result<Self, Failure> {
         let (guard, folder) = (folder.guard(), folder.path());
         let folder = folder.as_path();
-        run.config.write(folder)?;
-        let config = run.config.table()?;
-        write_cameras(&run, folder, None)?;
-        let mut checkpoint = None;
-        let (logs, totals) = match run.session.take() {
-            None => (Logs::create(folder)?, Totals::after(run.spent)),
-            Some(saved) => {
-                checkpoint = Some(run.trainer.steps_done());
-                let (logs, totals, lost) = Logs::resume(folder, saved)?;
-                for name in lost {
-                    observer.say(format_args!("note: {name} has lost records; they stay missing"));
-                }
-                (logs, totals)
-            }
-        };
+        let saved = run.session.take();
+        let Opened { config, logs, totals, lost } = open(&run, folder, saved)?;
+        for name in lost {
+            observer.say(format_args!("note: {name} has lost records; they stay missing"));
+        }
         let folder = folder.to_owned();
         let has_told_coordinates = false;
-        Ok(Self {
-            run,
-            config,
-            observer,
-            folder,
-            logs,
-            totals,
-            guard,
-            checkpoint,
-            has_told_coordinates,
-        })
+        Ok(Self { run, config, observer, folder, logs, totals, guard, has_told_coordinates })
     }
 
     /// Does all remaining steps.
@@ -278,23 +258,12 @@ impl<'a> Session<'a> {
     /// Writes a checkpoint.
     fn write_checkpoint(&mut self) -> Result<(), CheckpointError> {
         let step = self.run.trainer.steps_done();
-        if self.checkpoint == Some(step) {
+        if self.run.checkpoint == Some(step) {
             return Ok(());
         }
         self.guard.check()?;
-        let trainer = self.run.trainer.state();
-        let header = Header {
-            densify: self.run.config.densify.clone(),
-            budget: self.run.config.budget,
-            sh_degree: self.run.config.sh_degree,
-            config: self.config.clone(),
-            dataset: self.run.fingerprint.clone(),
-            trainer: trainer.map_err(|source| CheckpointError::Policy { source })?,
-            session: self.logs.save(&self.totals, self.run.process)?,
-        };
-        write(&checkpoint_path(&self.folder, step), &header, self.run.trainer.backend())?;
-        remove_older(&self.folder, step);
-        self.checkpoint = Some(step);
+        let session = self.logs.save(&self.totals, self.run.process)?;
+        write_state(&mut self.run, &self.folder, self.config.clone(), session)?;
         Ok(())
     }
 

@@ -18,7 +18,7 @@ use densify_core::numbers::grouped;
 use densify_data::dataset::PointCloud;
 use densify_data::views::{DatasetViews, ViewSource};
 use densify_render::Backend;
-use densify_train::checkpoint::Fingerprint;
+use densify_train::checkpoint::{Fingerprint, newest_step};
 use densify_train::init::apply_start_rule;
 use densify_train::schedule::RateOptions;
 use densify_train::trainer::{TrainOptions, Trainer};
@@ -93,6 +93,8 @@ pub(super) fn prepare(
     if companion.is_some() {
         trainer.record_history()?;
     }
+    let checkpoint = session.as_ref().map(|_| trainer.steps_done());
+    let newest_checkpoint = checkpoint.and_then(|_| newest_step(&output));
     Ok(Run {
         spec: spec.clone(),
         config,
@@ -105,6 +107,8 @@ pub(super) fn prepare(
         fingerprint,
         last,
         session,
+        checkpoint,
+        newest_checkpoint,
         spent,
         process,
     })

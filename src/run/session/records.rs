@@ -14,7 +14,7 @@ use densify_render::StepOutput;
 use densify_train::output::{Mean, RecordLog, StepRecord, TensorBoard};
 
 /// Sums and scores of the run so far.
-#[derive(Debug, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Totals {
     window: Window,
@@ -53,7 +53,7 @@ impl Spent {
 }
 
 /// Sums over the steps since the last record.
-#[derive(Debug, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Window {
     steps: u32,
@@ -141,7 +141,7 @@ pub(super) struct Logs {
 }
 
 /// Lengths of the logs at a checkpoint `[bytes]`.
-#[derive(Debug, Serialize, Deserialize)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Lengths {
     steps: u64,
@@ -150,7 +150,7 @@ struct Lengths {
 }
 
 /// The state of the session in a checkpoint.
-#[derive(Debug, Serialize, Deserialize)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct SavedSession {
     totals: Totals,

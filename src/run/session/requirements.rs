@@ -178,16 +178,16 @@ fn degree_left_out(config: &RunConfig) -> Option<LeftOut> {
     if config.resolved.sh_degree_lowered {
         return Some(LeftOut {
             what,
-            // The file names options as on the command line, even if a library started the run.
+            // In the file, options are spelled as on the command line, even if a library started the run.
             evidence: format!(
-                "{} holds fewer rows at this degree than the scene starts with",
+                "within {}, fewer rows fit at the requested degree than the scene starts with",
                 Spelling::Terminal.option("memory")
             ),
             loss: "the cost in quality was not measured".to_owned(),
         });
     }
     match config.resolved.sh_degree_from {
-        // A degree below the highest was set by an option.
+        // Here a degree below the highest was set by an option: no automatic reduction.
         DegreeSource::Given | DegreeSource::Undecided | DegreeSource::Untried => None,
         DegreeSource::Trial(trial) => Some(LeftOut {
             what,

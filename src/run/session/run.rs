@@ -39,9 +39,13 @@ pub struct Run {
     /// Identifies the dataset in checkpoints.
     pub(super) fingerprint: Fingerprint,
     /// The step at which the run ends.
-    pub(super) last: u32,
-    /// State of the logs, for a resumed run.
+    pub last: u32,
+    /// State of the logs, for a run that was resumed or has saved a checkpoint.
     pub(super) session: Option<SavedSession>,
+    /// Step of the last checkpoint that this run has written or resumed from.
+    pub(super) checkpoint: Option<u32>,
+    /// Step of the newest checkpoint in the run's folder, as this run has left or found it.
+    pub(super) newest_checkpoint: Option<u32>,
     /// Time spent before the first step on trial runs, if there were any.
     pub(super) spent: Option<Spent>,
     pub(super) process: ProcessMemory,

@@ -81,8 +81,8 @@ fn duration(video: &Path) -> Result<(f64, f64), PosesError> {
     let text = String::from_utf8_lossy(&described.stderr);
     if let Some((_, name)) = HDR.iter().find(|(curve, _)| text.contains(curve)) {
         return Err(fault(format!(
-            "its colours are HDR ({name}), which photographs are not; convert it to standard range, or record with HDR \
-             switched off"
+            "its colours are HDR ({name}), which densify does not read; convert it to standard range, or record with \
+             HDR switched off"
         )));
     }
     let seconds = parse_duration(&text).filter(|seconds| *seconds > 0.0).ok_or_else(|| {
@@ -110,7 +110,7 @@ fn parse_rate(text: &str) -> Option<f64> {
     before.rsplit(' ').next()?.parse().ok().filter(|rate| *rate > 0.0)
 }
 
-/// Variance of the Laplacian: comparable only between frames that show the same.
+/// Variance of the Laplacian: comparable only between frames with the same content.
 fn sharpness(frame: &Path) -> Option<f64> {
     let picture = image::open(frame).ok()?;
     let grey = picture.resize(SHARPNESS_SIDE, SHARPNESS_SIDE, FilterType::Triangle).to_luma8();

@@ -91,7 +91,7 @@ mod tests {
         assert!(journal.outcomes().eq(&all));
         assert_eq!(journal.outcome(&spec(1)), Some(&all[1]));
         assert_eq!(journal.outcome(&spec(2)), None);
-        // The folder holds the last run of its name.
+        // Runs of one name share a folder on disk, which holds the last of them; only that one counts.
         assert_eq!(journal.other_run("room", &spec(0)), Some(&all[1]));
         assert_eq!(journal.other_run("room", &spec(1)), None);
         assert_eq!(journal.other_run("cup", &spec(0)), None);

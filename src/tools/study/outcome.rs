@@ -55,6 +55,9 @@ pub(super) struct Outcome {
     pub(super) rows: usize,
     /// Largest number of Gaussians at any instant.
     pub(super) peak_rows: usize,
+    /// Spherical-harmonic degree of the model.
+    #[serde(default)]
+    pub(super) sh_degree: Option<u8>,
     /// Peak resident memory of the process `[bytes]`, if known.
     pub(super) peak_bytes: Option<u64>,
     /// Memory promised by the ledger `[bytes]`.
@@ -130,6 +133,7 @@ pub(super) fn sample(factor: &str, level: &str, seed: u32, psnr: f64) -> Outcome
         views: BTreeMap::new(),
         rows: 900,
         peak_rows: 1000,
+        sh_degree: Some(3),
         peak_bytes: None,
         ledger_bytes: 1,
         seconds: 1.25,

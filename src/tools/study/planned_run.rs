@@ -13,8 +13,8 @@ use super::outcome::Outcome;
 use super::process;
 use densify_core::files::{self, write_atomically};
 use densify_data::dataset::{GroundTruth, builtin};
-use densify_run::Partial;
 use densify_run::failure::{Failure, OTHER};
+use densify_run::{Partial, RunConfig};
 use densify_train::output::{
     CONFIG_FILE, geometry_of, model_path, scores_by_view, scores_of, summary_of,
 };
@@ -219,6 +219,7 @@ impl PlannedRun {
             views: scores_by_view(folder, iterations)?,
             rows: summary.rows,
             peak_rows: summary.peak_rows,
+            sh_degree: Some(RunConfig::read(folder)?.sh_degree),
             peak_bytes: summary.peak_bytes,
             ledger_bytes: summary.ledger_bytes,
             seconds: summary.seconds,

@@ -1,4 +1,4 @@
-//! Divides the spread of scores of single views into the parts of seeds and of views.
+//! Divides the variance of the scores of single views into the parts due to seeds and due to views.
 //!
 //! All runs of a scene are scored on the same views, so seeds and views are crossed: the value of seed k in view v is
 //! m + s(k) + w(v) + r(k, v), with independent random parts. Their variances follow from the mean squares of the two-way
@@ -20,14 +20,14 @@ pub(super) struct Spread {
     pub(super) seeds: f64,
     /// Variance between views, the same for all seeds.
     pub(super) views: f64,
-    /// Variance of what is left: views that single seeds render better or worse.
+    /// Variance of the rest: particular seeds render particular views better or worse.
     pub(super) rest: f64,
-    /// Squared standard error of the mean, if other seeds and other views had been drawn, and its degrees of freedom.
+    /// Squared standard error of the mean, with seeds and views as random draws, and its degrees of freedom.
     error: (f64, f64),
 }
 
 impl Spread {
-    /// The parts of the spread of `values`, by seed and view. Only views that all seeds have count; `None` for fewer
+    /// The parts of the spread of `values`, by seed and view. Uses only views that have a value for every seed; `None` for fewer
     /// than two seeds or views, or values that are not finite.
     pub(super) fn new(values: &[BTreeMap<&str, f64>]) -> Option<Self> {
         let (first, others) = values.split_first()?;
@@ -75,7 +75,7 @@ impl Spread {
         })
     }
 
-    /// Shares of the seeds, of the views and of the rest in the variance of the value of one seed in one view.
+    /// Fractions of the variance of a single value that are due to the seeds, to the views and to the rest.
     pub(super) fn shares(&self) -> [f64; 3] {
         let sum = self.seeds + self.views + self.rest;
         [self.seeds, self.views, self.rest].map(|part| if sum > 0.0 { part / sum } else { 0.0 })

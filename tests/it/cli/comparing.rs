@@ -135,7 +135,7 @@ fn all_policies_are_run_and_ranked() {
         assert!(has(1, 0) && has(0, 2), "{name}: {stdout}");
         assert!(table.contains(&format!("| {name} |")), "{name}: {table}");
     }
-    assert!(stdout.contains("from vanilla") && stdout.contains("320 rows: end"), "{stdout}");
+    assert!(stdout.contains("vs vanilla") && stdout.contains("320 rows: end"), "{stdout}");
     assert!(table.contains("### At most 320 rows\n"), "{table}");
 }
 

@@ -26,7 +26,8 @@ struct List {
 }
 
 /// Divides the frames of a model according to the lists beside it (`model` and `folder`: the model's root and folder) or
-/// in the dataset's folder; returns true if there are lists. Frames in no list are removed.
+/// in the dataset's folder; returns true if there are lists. A single list leaves the other frames to the other split; of
+/// two lists, frames in neither are removed.
 ///
 /// # Errors
 /// When a list names none of the photographs, or leaves none to train on.
@@ -76,7 +77,7 @@ pub(super) fn apply(
     note(count(&|i| !is_trained(i) && !is_tested(i)), "are in neither list and are not used");
     note(
         count(&|i| is_trained(i) && is_tested(i)),
-        "are listed for training and for tests, so their scores are not those of new views",
+        "are listed both for training and for tests, so their scores do not measure unseen views",
     );
     let divided = std::mem::take(frames).into_iter().enumerate().flat_map(|(index, frame)| {
         let trained = is_trained(index).then(|| frame.clone());

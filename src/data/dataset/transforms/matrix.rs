@@ -41,7 +41,8 @@ impl Fields<'_> {
         // In OpenCV, y and z point the opposite way.
         let column = |j: usize| DVec3::new(m[0][j], m[1][j], m[2][j]);
         let world_from_camera = DMat3::from_cols(column(0), -column(1), -column(2));
-        // Scaled axes, such as those of a scaled camera in Blender, project every point to the same pixel.
+        // Axes that are all scaled alike, as those of a scaled camera in Blender, show every point in the same pixel as
+        // without the scale.
         let scale = world_from_camera.determinant().abs().cbrt();
         let is_scaled = scale.is_normal() && (scale * scale - 1.0).abs() > ROTATION_TOLERANCE;
         let world_from_camera =

@@ -78,7 +78,11 @@ pub(super) fn table(outcomes: &[Outcome], policies: &[String]) -> Table {
                     (difference.format(score.digits), format!("{better} of {}", difference.pairs))
                 }
                 None if standing.rank.is_some() => ("–".to_owned(), "–".to_owned()),
-                None => ("not ranked: no pair kept its budget".to_owned(), "–".to_owned()),
+                None => (
+                    "not ranked: with no seed did it and the first policy both keep the budget"
+                        .to_owned(),
+                    "–".to_owned(),
+                ),
             };
             cells.extend([shown, better, standing.rank()]);
         }
@@ -96,7 +100,7 @@ pub(super) fn format(outcomes: &[Outcome], policies: &[String]) -> String {
         ">rank",
         "<policy",
         ">PSNR [dB]",
-        &format!("<from {first}"),
+        &format!("<vs {first}"),
         ">SSIM",
         ">rank",
         ">FLIP",
@@ -113,7 +117,7 @@ pub(super) fn format(outcomes: &[Outcome], policies: &[String]) -> String {
             outcomes.iter().filter(|r| r.factor == *policy).partition(|r| r.kept_its_budget());
         let over = match over.len() {
             0 => String::new(),
-            over => format!("({over} more over the budget, not counted)"),
+            over => format!("(and {over} over the budget, not counted)"),
         };
         let standing = &psnr.0[index];
         let format = |difference: Difference| difference.format(psnr.1.digits);
@@ -194,7 +198,7 @@ rank  policy  PSNR [dB]  from a                  SSIM  rank    FLIP  rank  runs
         let broken = Outcome { peak_rows: 1001, ..run("b", "room", 0, 99.0) };
         let all = [broken, run("a", "room", 0, 30.0), run("c", "room", 0, 29.0)];
         let text = table(&all, &["a", "b", "c"].map(String::from)).to_string();
-        assert!(text.contains("| b | not ranked: no pair kept its budget | – | – |"), "{text}");
+        assert!(text.contains("| b | not ranked: with no seed did it and the first policy both keep the budget | – | – |"), "{text}");
         assert!(text.contains("| c | -1.00, one run | 0 of 1 | 2 |"), "{text}");
         let text = format(&all, &["b", "a", "c"].map(String::from));
         // Without runs of the first policy there are no differences.

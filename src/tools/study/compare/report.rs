@@ -51,6 +51,7 @@ pub(super) fn document(outcomes: &[Outcome], policies: &[String]) -> Document {
             "rows",
             "true peak",
             "budget",
+            "SH degree",
             "promised memory [MiB]",
             "peak memory [MiB]",
             "time [s]",
@@ -123,6 +124,9 @@ fn row(policy: &str, first: &str, here: &[&Outcome]) -> Vec<Text> {
     let mib = |r: &Outcome| r.peak_bytes.map(in_mib);
     let budget = runs.iter().map(|r| r.budget).max().unwrap_or(0);
     let rows = mean_of(&runs, |r| Some(r.rows as f64)).unwrap_or(0.0);
+    // With `--sh-degree auto`, the runs of a policy may differ.
+    let degrees: BTreeSet<u8> = runs.iter().filter_map(|run| run.sh_degree).collect();
+    let degrees: Vec<String> = degrees.iter().map(u8::to_string).collect();
     vec![
         policy.into(),
         score(|r| r.psnr, 2).into(),
@@ -131,6 +135,7 @@ fn row(policy: &str, first: &str, here: &[&Outcome]) -> Vec<Text> {
         grouped(rows.round() as usize).into(),
         peak_cell,
         grouped(budget).into(),
+        degrees.join(", ").into(),
         number_or_dash(mean_of(&runs, |r| Some(in_mib(r.ledger_bytes))), 0).into(),
         number_or_dash(mean_of(&runs, mib), 0).into(),
         number_or_dash(mean_of(&runs, |r| Some(r.seconds)), 1).into(),
@@ -206,20 +211,21 @@ mod tests {
         let text = document(&all, &policies).to_string();
         assert!(text.contains("| b | +0.50, two runs | 2 of 2 | 1 |"), "{text}");
         assert!(text.contains("| b | 31.50 (+0.50, two runs) |"), "{text}");
-        let more = [record("a", 2, 30.0, 1000), record("b", 2, 31.5, 1000)];
+        let other_degree = Outcome { sh_degree: Some(0), ..record("a", 2, 30.0, 1000) };
+        let more = [other_degree, record("b", 2, 31.5, 1000)];
         let text = document(&[&all[..], &more].concat(), &policies).to_string();
         // Student's t of two degrees of freedom, 4.303, times √(1/3)/√3.
         assert!(text.contains("| b | +0.83 [-0.60, +2.27] | 3 of 3 | 1 |"), "{text}");
         assert!(text.contains("| b | 900 | 1,000 |"), "{text}");
         assert!(text.contains("| c | not ranked"), "{text}");
         assert!(
-            text.contains("| a | 30.67 | 0.3067 | 0.6933 | 900 | 1,000 | 1,000 | 0 | – |"),
+            text.contains("| a | 30.67 | 0.3067 | 0.6933 | 900 | 1,000 | 1,000 | 0, 3 | 0 | – |"),
             "{text}"
         );
         assert!(text.contains("1,001 **over the budget: not ranked**"), "{text}");
         assert!(!text.contains("Geometry"), "{text}");
         let text = summary(&all, &policies);
-        let row_of_c = "   –  c               –                        –     –       –     –     0  (2 more over";
+        let row_of_c = "   –  c               –                        –     –       –     –     0  (and 2 over";
         assert!(
             text.contains(row_of_c) && text.contains("b          31.500  +0.50, two runs"),
             "{text}"

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use plotters::prelude::*;
 
-use super::results::{PSNR, Results, SECONDS};
+use super::results::{LOG_SECONDS, PSNR, Results};
 use crate::Picture;
 use crate::plot::{self, Area, range};
 use densify_run::failure::Failure;
@@ -49,7 +49,7 @@ fn points(results: &Results, scene: &str) -> Vec<Point> {
         let name = if factor.is_empty() { "exact".to_owned() } else { format!("{factor}={level}") };
         Some(Point {
             name,
-            seconds: results.mean(scene, factor, level, SECONDS)?.exp(),
+            seconds: results.mean(scene, factor, level, LOG_SECONDS)?.exp(),
             psnr: results.mean(scene, factor, level, PSNR)? - base,
             peak: results.peak_mib(scene, factor, level)?,
             is_optimal: false,

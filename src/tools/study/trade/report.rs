@@ -3,7 +3,7 @@
 use std::fmt::Write;
 
 use super::Trade;
-use super::results::{Effect, PSNR, Results, SECONDS};
+use super::results::{Effect, LOG_SECONDS, PSNR, Results};
 use crate::difference::{Difference, INTERVALS};
 use crate::text_table::{number_or_dash, or_dash};
 use densify_core::numbers::grouped;
@@ -41,7 +41,7 @@ fn exact_table(results: &Results) -> Table {
     let mut table = Table::new(["scene", "PSNR [dB]", "time [s]", "peak [MiB]"].map(Column::text));
     for scene in &results.scenes {
         let psnr = number_or_dash(results.mean(scene, "", "", PSNR), 2);
-        let seconds = number_or_dash(results.mean(scene, "", "", SECONDS).map(f64::exp), 1);
+        let seconds = number_or_dash(results.mean(scene, "", "", LOG_SECONDS).map(f64::exp), 1);
         let peak = number_or_dash(results.peak_mib(scene, "", ""), 0);
         table.row([scene.clone(), psnr, seconds, peak]);
     }

@@ -35,10 +35,10 @@ type Measure = fn(&Outcome) -> Option<f64>;
 
 pub(super) const PSNR: Measure = |r| Some(r.psnr);
 const SSIM: Measure = |r| Some(r.ssim);
-pub(super) const SECONDS: Measure = |r| positive(r.seconds).map(f64::ln);
-const CPU: Measure = |r| positive(r.cpu_seconds?).map(f64::ln);
-/// Peak memory, or the promised memory if the system does not report the peak.
-const PEAK: Measure = |r| positive(r.peak_bytes.unwrap_or(r.ledger_bytes) as f64).map(f64::ln);
+pub(super) const LOG_SECONDS: Measure = |r| positive(r.seconds).map(f64::ln);
+const LOG_CPU: Measure = |r| positive(r.cpu_seconds?).map(f64::ln);
+/// Logarithm of the peak memory, or of the promised memory if the system does not report the peak.
+const LOG_PEAK: Measure = |r| positive(r.peak_bytes.unwrap_or(r.ledger_bytes) as f64).map(f64::ln);
 
 fn positive(value: f64) -> Option<f64> {
     (value.is_finite() && value > 0.0).then_some(value)
@@ -85,9 +85,9 @@ impl Results {
             level: level.to_owned(),
             psnr: difference(PSNR)?,
             ssim: difference(SSIM)?,
-            seconds: difference(SECONDS)?,
-            cpu: difference(CPU),
-            peak: difference(PEAK)?,
+            seconds: difference(LOG_SECONDS)?,
+            cpu: difference(LOG_CPU),
+            peak: difference(LOG_PEAK)?,
             identical,
         })
     }
@@ -104,9 +104,9 @@ impl Results {
         mean(runs.map(measure).collect::<Option<Vec<f64>>>()?)
     }
 
-    /// Mean peak memory of the runs with a factor at a level in a scene `[MiB]`.
+    /// Geometric mean of the peak memory of the runs with a factor at a level in a scene `[MiB]`.
     pub(super) fn peak_mib(&self, scene: &str, factor: &str, level: &str) -> Option<f64> {
-        self.mean(scene, factor, level, PEAK).map(|peak| peak.exp() / f64::from(1 << 20))
+        self.mean(scene, factor, level, LOG_PEAK).map(|peak| peak.exp() / f64::from(1 << 20))
     }
 }
 

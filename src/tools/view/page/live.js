@@ -26,7 +26,7 @@ function followTraining(requestPicture) {
   byId("one-step").addEventListener("click", () => order("step"));
   byId("checkpoint").addEventListener("click", () => order("checkpoint"));
   byId("stop").addEventListener("click", () => {
-    if (confirm("Stop training? It writes a checkpoint, from which densify train --resume continues.")) order("stop");
+    if (confirm("Stop training? A checkpoint is written first; densify train --resume continues from it.")) order("stop");
   });
 
   async function ask() {
