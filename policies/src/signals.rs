@@ -43,7 +43,7 @@ pub enum PixelSum {
 /// Declares the signals, each with name, kind, unit and pixel sums.
 macro_rules! signals {
     ($(
-        $(#[$doc:meta])*
+        $(#[doc = $doc:literal])*
         $name:ident: $kind:ident $(($width:literal))? $unit:literal [$($sum:ident),*];
     )*) => {
         /// A statistic of each row that a policy may read: one or [several](Self::width) `f32`.
@@ -52,7 +52,7 @@ macro_rules! signals {
         )]
         #[serde(rename_all = "snake_case")]
         pub enum Signal {
-            $($(#[$doc])* $name,)*
+            $($(#[doc = $doc])* $name,)*
         }
 
         impl Signal {
@@ -63,6 +63,13 @@ macro_rules! signals {
             pub const fn kind(self) -> SignalKind {
                 match self {
                     $(Self::$name => SignalKind::$kind $(($width))?,)*
+                }
+            }
+
+            /// The meaning: the documentation of the variant, with its links.
+            pub const fn meaning(self) -> &'static str {
+                match self {
+                    $(Self::$name => concat!($($doc),*),)*
                 }
             }
 

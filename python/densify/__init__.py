@@ -58,7 +58,9 @@ from ._needs import (
     PixelMap,
     Rate,
     Rates,
+    SignalInfo,
     Start,
+    signals,
 )
 from ._policy import PolicyInfo, check_policy, import_policies, interval, policies, policy, state, step
 from ._opened import Scores, cameras, evaluate, export, render
@@ -105,6 +107,7 @@ __all__ = [
     "Run",
     "Scene",
     "Scores",
+    "SignalInfo",
     "Start",
     "Step",
     "Trainer",
@@ -133,6 +136,7 @@ __all__ = [
     "quantile",
     "render",
     "scenegen",
+    "signals",
     "smallest",
     "spare_one",
     "split",

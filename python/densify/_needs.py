@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
+from . import _densify
 from ._names import Column, Signal
 
 
@@ -132,9 +134,41 @@ class Aux:
 
 
 @dataclass(frozen=True)
+class SignalInfo:
+    """A signal: a statistic of each row.
+
+    It has ``width`` numbers per row. If ``is_resettable``, it accumulates over views until a plan resets it.
+    """
+
+    name: str
+    unit: str
+    width: int
+    is_resettable: bool
+    meaning: str
+
+
+def signals() -> list[SignalInfo]:
+    """All signals that a policy can declare, with their meaning."""
+    found = []
+    for name, unit, width, is_resettable, meaning in _densify.signals():
+        # Links to Rust items become their names, in the spelling of Python.
+        plain = re.sub(r"\[`([^`]+)`\]\([^)]*\)|\[`([^`]+)`\]", lambda link: _spelled(link[1] or link[2]), meaning)
+        found.append(SignalInfo(name, unit, width, is_resettable, " ".join(plain.split())))
+    return found
+
+
+def _spelled(item: str) -> str:
+    """``WeightSum`` as weight_sum; ``Needs::full_depth`` as Needs.full_depth."""
+    if "::" in item:
+        return item.replace("::", ".")
+    return re.sub(r"(?<=[a-z])([A-Z])", r"_\1", item).lower()
+
+
+@dataclass(frozen=True)
 class Needs:
     """The inputs of a policy, and its changes to initialisation and training. Only these are computed.
 
+    ``signals()`` explains the signals.
     ``scratch_bytes`` is memory per row that the policy takes at an event beyond 32 bytes; the run's memory includes it.
     """
 

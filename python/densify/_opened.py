@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from os import fspath
 from pathlib import Path
 from typing import Any
@@ -23,8 +23,8 @@ class Scores:
     """Scores of a model: their mean over views, those of each view, and the geometry where it is known."""
 
     mean: dict[str, float]
-    views: dict[str, dict[str, float]]
-    geometry: dict[str, Any] | None = None
+    views: dict[str, dict[str, float]] = field(repr=False)
+    geometry: dict[str, Any] | None = field(default=None, repr=False)
 
     @property
     def psnr(self) -> float:

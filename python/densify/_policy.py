@@ -13,7 +13,7 @@ import platform
 import sys
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast
@@ -52,8 +52,8 @@ class PolicyInfo:
     summary: str
     source: str
     place: str
-    manual: str
-    parameters: dict[str, str]
+    manual: str = field(repr=False)
+    parameters: dict[str, str] = field(repr=False)
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,7 @@ class Listener:
         self._on_edit = on_edit
         self._on_test = on_test
         self._last = self._done = 0
+        self._text = ""
         self._shown = False
         self._start = 0.0
         self._line: Any = None
@@ -45,11 +46,11 @@ class Listener:
         if self._on_step is not None:
             self._on_step(step, loss, rows)
         now = time.monotonic()
-        if self._progress and (now - self._drawn >= 0.1 or step == self._last):
+        speed = (step - self._done) / max(now - self._start, 1e-9)
+        self._text = f"step {step}/{self._last}  {speed:.1f} it/s  loss {loss:.4f}  {rows:,} Gaussians"
+        if self._progress and now - self._drawn >= 0.1:
             self._drawn = now
-            speed = (step - self._done) / max(now - self._start, 1e-9)
-            text = f"step {step}/{self._last}  {speed:.1f} it/s  loss {loss:.4f}  {rows:,} Gaussians"
-            self._draw(text)
+            self._draw()
 
     def recorded(self, record: str) -> None:
         if self._on_record is not None:
@@ -65,9 +66,13 @@ class Listener:
             self._on_test(step, mean)
 
     def end(self) -> None:
+        # The last step may have been too soon after another one.
+        if self._progress and self._text:
+            self._draw()
         self._clear()
 
-    def _draw(self, text: str) -> None:
+    def _draw(self) -> None:
+        text = self._text
         handle = _notebook_line(self._line, text)
         if handle is not None:
             self._line = handle

@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import html
 import json
-import tempfile
 from collections.abc import Iterator
 from os import fspath
 from pathlib import Path
@@ -18,7 +17,7 @@ from . import _densify
 from ._errors import InputError
 from ._opened import Scores, evaluate, export, render, some_views
 from ._progress import Listener
-from ._scenes import Dataset, Model, Rendering, StrPath
+from ._scenes import Dataset, Model, Rendering, StrPath, png
 from ._settings import Split
 
 
@@ -53,11 +52,15 @@ class Run:
     @property
     def scores(self) -> dict[str, float]:
         """Mean scores of the test views at the last measured iteration; empty without test views."""
+        tests = self.tests
+        return tests[max(tests)] if tests else {}
+
+    @property
+    def tests(self) -> dict[int, dict[str, float]]:
+        """Mean scores of the test views at each measured iteration (``test_iterations``, and the last)."""
         path = self.folder / "results.json"
-        if not path.is_file():
-            return {}
-        entries: dict[str, dict[str, float]] = json.loads(path.read_text("utf-8"))
-        return max(entries.items(), key=lambda entry: int(entry[0].rpartition("_")[2]))[1]
+        entries: dict[str, dict[str, float]] = json.loads(path.read_text("utf-8")) if path.is_file() else {}
+        return {int(name.rpartition("_")[2]): scores for name, scores in entries.items()}
 
     @property
     def curves(self) -> dict[str, NDArray[np.float64]]:
@@ -146,10 +149,6 @@ def _curve(steps: NDArray[np.float64], values: NDArray[np.float64], name: str) -
 
 def _picture(view: Rendering) -> str:
     both = [view.pixels()] if view.photograph is None else [view.photograph, view.pixels()]
-    pixels = np.ascontiguousarray(np.concatenate(both, axis=1))
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "view.png"
-        _densify.write_image(fspath(path), pixels)
-        data = base64.b64encode(path.read_bytes()).decode()
+    data = base64.b64encode(png(np.concatenate(both, axis=1))).decode()
     name = html.escape(view.name, quote=True)
     return f'<figure><img alt="{name}" src="data:image/png;base64,{data}"><figcaption>{name}</figcaption></figure>'

@@ -97,6 +97,21 @@ class Rendering:
         """Writes the colours as a PNG file."""
         _densify.write_image(fspath(path), np.ascontiguousarray(self.pixels()))
 
+    def __repr__(self) -> str:
+        height, width = self.alpha.shape
+        return f"<densify.Rendering {self.name} {width}x{height}>"
+
+    def _repr_png_(self) -> bytes:
+        return png(self.pixels())
+
+
+def png(pixels: NDArray[np.uint8]) -> bytes:
+    """Pixels as a PNG file."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "picture.png"
+        _densify.write_image(fspath(path), np.ascontiguousarray(pixels))
+        return path.read_bytes()
+
 
 def colour_of(background: str | Sequence[float]) -> list[float]:
     """A background as three numbers."""

@@ -59,7 +59,8 @@ class Comparison:
         return self.summary
 
     def _repr_html_(self) -> str:
-        return f"<pre>{html.escape(self.summary)}</pre>"
+        page = html.escape(str(self.page))
+        return f"<pre>{html.escape(self.summary)}</pre><p>with pictures: {page}</p>"
 
 
 def compress(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -49,9 +49,9 @@ class Buffer:
 class MemoryPlan:
     """The memory of a run: every buffer, the total, and other sizes that fit the same memory."""
 
-    ledger: list[Buffer]
+    ledger: list[Buffer] = field(repr=False)
     total_bytes: int
-    text: str
+    text: str = field(repr=False)
     #: Rows that fit ``memory`` at each degree, for each resolution in ``resolutions``.
     memory: int
     resolutions: list[int]
@@ -76,6 +76,8 @@ def train(
     **options: Unpack[Options],
 ) -> Run:
     """Trains a scene and writes all files of the run, as ``densify train`` does.
+
+    Options are those of ``densify train --help``, with underscores: ``resolution=4, budget="200k", eval=True``.
 
     ``policy`` is a name (default: diet), or a class or an instance made with ``@densify.policy``. ``on_step`` gets
     step, loss and rows; ``on_record`` a record of every tenth step; ``on_edit`` each edit of the rows; ``on_test`` a
@@ -102,7 +104,7 @@ def prepare(
 ) -> Trainer:
     """Prepares a run to step through. Nothing is written before ``save_checkpoint`` or ``finish``.
 
-    ``resume=True`` continues the run in ``output`` from its last checkpoint.
+    ``resume=True`` continues the run in ``output`` from its last checkpoint. ``progress`` prints how the run is prepared.
     """
     _policy.check_not_importing()
     table = table_of(scene, policy, output, options)
@@ -168,7 +170,7 @@ class Trainer:
         raise Interrupted(message)
 
     def stop(self) -> None:
-        """Ends the loop over this trainer before its next step; other threads may call it."""
+        """Ends the loop over this trainer with Interrupted before its next step; other threads may call it."""
         self._stop.ask()
 
     def save_checkpoint(self) -> Path:

@@ -101,6 +101,7 @@ impl Listener {
                 error: RefCell::default(),
                 looked: Cell::new(None),
                 drawn: Cell::new(None),
+                hidden: Cell::new(None),
             };
             let done = work(&follower);
             raised = follower.error.into_inner();
@@ -119,6 +120,8 @@ pub(crate) struct Follower {
     looked: Cell<Option<Instant>>,
     /// When progress was last shown.
     drawn: Cell<Option<Instant>>,
+    /// The last step, if it was not shown: step, loss and rows.
+    hidden: Cell<Option<(u32, f32, usize)>>,
 }
 
 impl Follower {
@@ -130,6 +133,10 @@ impl Follower {
         if let Err(error) = Python::attach(|py| call(object.bind(py))) {
             *self.error.borrow_mut() = Some(error);
         }
+    }
+
+    fn show(&self, step: u32, loss: f32, rows: usize) {
+        self.tell(|object| object.call_method1("step", (step, loss, rows)).map(drop));
     }
 
     fn tell_json(&self, method: &str, value: &impl serde::Serialize) {
@@ -174,7 +181,10 @@ impl Observer for Follower {
 
     fn step(&self, step: u32, loss: f32, rows: usize) {
         if self.listener.every_step || is_time(&self.drawn) {
-            self.tell(|object| object.call_method1("step", (step, loss, rows)).map(drop));
+            self.hidden.set(None);
+            self.show(step, loss, rows);
+        } else {
+            self.hidden.set(Some((step, loss, rows)));
         }
     }
 
@@ -191,6 +201,9 @@ impl Observer for Follower {
     }
 
     fn end(&self) {
+        if let Some((step, loss, rows)) = self.hidden.take() {
+            self.show(step, loss, rows);
+        }
         self.tell(|object| object.call_method0("end").map(drop));
     }
 

@@ -73,8 +73,13 @@ pub(crate) fn prepare(
 ) -> PyResult<TrainerCore> {
     Listener::new(Some(listener), None)?.follow(py, |follower| {
         let given = options::partial(options)?;
+        let is_named = given.get("output").is_some();
         let (spec, resumed) =
             if resume { start(given, follower)? } else { (given.describe()?, None) };
+        // A folder that the user names is to hold checkpoints, so an occupied one is refused before any step.
+        if is_named && !resume {
+            RunFolder::check(&spec.output_folder()?, false)?;
+        }
         restart_peak();
         let run = Run::prepare_on(&spec, resumed, Host::new(follower))?;
         let (last, ledger) = (run.last, run.ledger.clone());
@@ -164,8 +169,11 @@ impl TrainerCore {
             return Err(over(why));
         }
         let run = state.run()?;
+        if run.trainer.steps_done() >= self.last {
+            return Err(over(FINISHED));
+        }
         let done = detached(py, move || {
-            let report = run.trainer.step()?;
+            let report = run.step()?;
             let name = run.trainer.views().name(report.view).to_owned();
             // Edits are plain numbers and text.
             let events = serde_json::to_string(&report.events).unwrap_or_default();

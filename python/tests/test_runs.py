@@ -248,13 +248,54 @@ def test_a_stepped_run_is_saved_and_resumed(scene: Path, tmp_path: Path) -> None
     assert (run.folder / model).read_bytes() == (whole.folder / model).read_bytes()
     # Another run, and a folder that cannot be made, stay as they are; the trainer is not lost.
     before = sorted(path.name for path in whole.folder.iterdir())
+    with pytest.raises(densify.InputError, match="another run; continue it with resume=True"):
+        densify.prepare(scene, output=whole.folder, **SMALL)
+    other = densify.prepare(scene, output=tmp_path / "file" / "run", **SMALL)
     (tmp_path / "file").touch()
-    for output, words in ((whole.folder, "another run"), (tmp_path / "file" / "run", "file")):
-        other = densify.prepare(scene, output=output, **SMALL)
-        with pytest.raises(densify.DensifyError, match=words):
-            other.save_checkpoint()
-        assert other.step().step == 1
+    with pytest.raises(densify.DensifyError, match="file"):
+        other.save_checkpoint()
+    assert other.step().step == 1
     assert sorted(path.name for path in whole.folder.iterdir()) == before
+
+
+def test_a_stepped_run_has_the_records_of_a_whole_one(scene: Path, tmp_path: Path) -> None:
+    from .made import make
+
+    policy = make("prunes_the_first", lambda now, rng, plan: plan.prune([0]))
+    options: dict[str, Any] = {**SMALL, "eval": True, "policy": policy}
+    whole = densify.train(scene, output=tmp_path / "whole", progress=False, **options)
+    trainer = densify.prepare(scene, output=tmp_path / "run", **options)
+    for step in trainer:
+        if step.step == 25:
+            trainer.save_checkpoint()
+    # A step beyond the end would have no model.
+    with pytest.raises(RuntimeError, match="trained to the end"):
+        trainer.step()
+    run = trainer.finish(progress=False)
+    assert run.events == whole.events and len(run.events) > 3
+    for name in ("step", "loss", "l1", "ssim", "rows"):
+        assert (run.curves[name] == whole.curves[name]).all(), name
+    assert run.scores == whole.scores and run.tests == {60: run.scores}
+    assert run.summary["seconds"] > 0 and (np.diff(run.curves["seconds"]) > 0).all()
+
+
+def test_objects_are_short_in_a_notebook(run: densify.Run, scene: Path) -> None:
+    view = next(run.render())
+    assert repr(view) == "<densify.Rendering images/00002.png 32x24>" and view._repr_png_().startswith(b"\x89PNG")
+    for shown in (run.evaluate(), densify.plan(scene, budget=500, backend="cpu"), densify.policies()[0]):
+        assert len(repr(shown)) < 500, shown
+    known = {signal.name: signal for signal in densify.signals()}
+    assert known["weight_max_root"].meaning.startswith("Sum over views of √w") and known["position"].width == 3
+    assert not any("[" in signal.meaning and "](" in signal.meaning or "`" in signal.meaning for signal in known.values())
+
+
+def test_progress_ends_with_the_last_step(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from densify import _progress
+
+    drawn: list[str] = []
+    monkeypatch.setattr(_progress.Listener, "_draw", lambda self: drawn.append(self._text))
+    densify.train(scene, output=tmp_path / "run", **SMALL)
+    assert drawn[-1].startswith("step 60/60 ") and len(drawn) < 30
 
 
 @not_on_windows

@@ -164,7 +164,7 @@ pub fn check_policy_with(entry: &PolicyEntry, set: &Table) -> Result<(), Report>
         }
         if !edits_rows && report.failures.is_empty() {
             let reason = "no plan of any run changed a row, although models had up to 5,000 rows and room \
-                       to grow; use check_policy_with to set parameters with which the policy acts";
+                       to grow; check it with parameters with which it acts";
             report.add(Check::Edits, reason.to_owned());
         }
     }

@@ -30,10 +30,14 @@ fn name_of(value: &impl Serialize) -> String {
     name.and_then(|name| name.as_str().map(str::to_owned)).unwrap_or_default()
 }
 
-/// Names of all signals, with unit and numbers per row.
+/// Names of all signals, with unit, numbers per row, true if it is reset by a plan, and meaning.
 #[pyfunction]
-pub(crate) fn signals() -> Vec<(String, &'static str, usize)> {
-    Signal::ALL.iter().map(|signal| (name_of(signal), signal.unit(), signal.width())).collect()
+pub(crate) fn signals() -> Vec<(String, &'static str, usize, bool, &'static str)> {
+    let signal = |signal: &Signal| {
+        let (unit, width) = (signal.unit(), signal.width());
+        (name_of(signal), unit, width, signal.is_resettable(), signal.meaning())
+    };
+    Signal::ALL.iter().map(signal).collect()
 }
 
 /// Names of all columns of auxiliary views.

@@ -348,8 +348,8 @@ mod tests {
     #[test]
     fn an_occupied_folder_names_the_options_that_help() {
         let failure = Failure::from(FolderError::Occupied { folder: "out".into() });
-        let expected =
-            "out holds another run; choose another folder with -o, or replace it with --overwrite";
+        let expected = "out holds another run; continue it with --resume, choose another folder with -o, or replace it with \
+             --overwrite";
         assert_eq!((failure.code, &*failure.to_string()), (INPUT, expected));
     }
 }

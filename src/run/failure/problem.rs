@@ -174,7 +174,7 @@ pub enum Problem {
 /// The remedy for an error of training: in the output folder, the first Gaussians or the views.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum TrainRemedy {
-    /// Another folder, or replacing the run in this one.
+    /// Another folder, or continuing or replacing the run in this one.
     OtherFolderOrOverwrite,
     /// Waiting for the process that trains in the folder, stopping it, or another folder.
     WaitOrOtherFolder,

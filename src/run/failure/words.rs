@@ -156,7 +156,10 @@ impl TrainRemedy {
         let (folder, overwrite) = (output_option(s), s.switch("overwrite"));
         match self {
             Self::OtherFolderOrOverwrite => {
-                format!("choose another folder with {folder}, or replace it with {overwrite}")
+                let resume = s.switch("resume");
+                format!(
+                    "continue it with {resume}, choose another folder with {folder}, or replace it with {overwrite}"
+                )
             }
             Self::WaitOrOtherFolder => {
                 format!("wait for it, stop it, or choose another folder with {folder}")
@@ -475,13 +478,19 @@ impl TrainingProblem {
             Self::LeftBehind { run, checkpoint: None, .. } => {
                 format!("the files written so far are in {}", run.display())
             }
-            Self::LeftBehind { run, checkpoint: Some(checkpoint), scene } => format!(
-                "the files written so far are in {run}, with the checkpoint {}; continue with: densify train {} -o \
-                 {run} --resume",
-                checkpoint.display(),
-                scene.display(),
-                run = run.display()
-            ),
+            Self::LeftBehind { run, checkpoint: Some(checkpoint), scene } => {
+                let (run, scene) = (run.display(), scene.display());
+                let command = match s {
+                    Spelling::Terminal => format!("densify train {scene} -o {run} --resume"),
+                    Spelling::Keyword => {
+                        format!("densify.train({}, {})", s.text("output", &run), s.switch("resume"))
+                    }
+                };
+                let checkpoint = checkpoint.display();
+                format!(
+                    "the files written so far are in {run}, with the checkpoint {checkpoint}; continue with: {command}"
+                )
+            }
         }
     }
 }

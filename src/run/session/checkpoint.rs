@@ -2,9 +2,10 @@
 
 use std::path::{Path, PathBuf};
 
-use super::records::{Logs, SavedSession, Totals};
+use super::records::{Logs, SavedSession, Unwritten};
 use super::{Run, write_cameras};
 use crate::failure::{Failure, ResumeProblem};
+use crate::observer::Silent;
 use densify_train::checkpoint::{
     CheckpointError, Header, checkpoint_path, newest_step, remove_older, write,
 };
@@ -15,25 +16,21 @@ pub(super) struct Opened {
     /// The configuration in the form in which checkpoints store it.
     pub(super) config: toml::Table,
     pub(super) logs: Logs,
-    pub(super) totals: Totals,
     /// Names of logs that have lost records.
     pub(super) lost: Vec<&'static str>,
 }
 
-/// Writes the configuration and the cameras into `folder`, and opens the logs there, in the state that was `saved`.
-pub(super) fn open(
-    run: &Run,
-    folder: &Path,
-    saved: Option<SavedSession>,
-) -> Result<Opened, Failure> {
+/// Writes the configuration, the cameras, and what the logs lack, into `folder`.
+pub(super) fn open(run: &mut Run, folder: &Path) -> Result<Opened, Failure> {
     run.config.write(folder)?;
     let config = run.config.table()?;
     write_cameras(run, folder, None)?;
-    let (logs, totals, lost) = match saved {
-        None => (Logs::create(folder)?, Totals::after(run.spent), Vec::new()),
-        Some(saved) => Logs::resume(folder, saved)?,
+    let (mut logs, lost) = match &run.logs {
+        None => (Logs::create(folder)?, Vec::new()),
+        Some(lengths) => Logs::resume(folder, lengths)?,
     };
-    Ok(Opened { config, logs, totals, lost })
+    logs.write(&run.unwritten, &Silent)?;
+    Ok(Opened { config, logs, lost })
 }
 
 /// Writes a checkpoint of the run's present state into `folder`, and removes older ones. `config` is the run's
@@ -64,7 +61,7 @@ pub(super) fn write_state(
 
 impl Run {
     /// Writes the configuration and a checkpoint into the run's folder, from which the run can be resumed, and returns
-    /// the folder; this run can also go on. Steps that were done one by one have no records in the logs.
+    /// the folder; this run can also go on.
     ///
     /// # Errors
     /// When the folder contains another run, or this run was continued there by somebody else; when it cannot be
@@ -74,17 +71,14 @@ impl Run {
         if self.checkpoint == Some(self.trainer.steps_done()) {
             return Ok(self.output.clone());
         }
-        let is_new = self.session.is_none();
+        let is_new = self.logs.is_none();
         let folder = if is_new {
             RunFolder::create(&self.output, false)?
         } else {
             RunFolder::resume(&self.output, false)?
         };
         match self.save_into(&folder.path()) {
-            Ok(session) => {
-                self.session = Some(session);
-                Ok(folder.path())
-            }
+            Ok(()) => Ok(folder.path()),
             Err(failure) if is_new => {
                 folder.discard();
                 Err(failure)
@@ -98,16 +92,19 @@ impl Run {
     /// # Errors
     /// [`ResumeProblem::Continued`].
     pub fn check_continued(&self) -> Result<(), Failure> {
-        if self.session.is_some() && newest_step(&self.output) != self.newest_checkpoint {
+        if self.logs.is_some() && newest_step(&self.output) != self.newest_checkpoint {
             return Err(ResumeProblem::Continued { output: self.output.clone() }.into());
         }
         Ok(())
     }
 
-    fn save_into(&mut self, folder: &Path) -> Result<SavedSession, Failure> {
-        let Opened { config, logs, totals, .. } = open(self, folder, self.session.clone())?;
-        let session = logs.save(&totals, self.process)?;
+    fn save_into(&mut self, folder: &Path) -> Result<(), Failure> {
+        let Opened { config, logs, .. } = open(self, folder)?;
+        let session = logs.save(&self.totals, self.process)?;
         write_state(self, folder, config, session.clone())?;
-        serde_json::from_value(session).map_err(Failure::input)
+        let SavedSession { logs, .. } = serde_json::from_value(session).map_err(Failure::input)?;
+        self.logs = Some(logs);
+        self.unwritten = Unwritten::default();
+        Ok(())
     }
 }

@@ -19,9 +19,7 @@ pub use run::Run;
 
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
-use std::time::Instant;
 
-use cpu_time::ProcessTime;
 use glam::DVec3;
 
 use crate::failure::{Failure, INPUT, OTHER, TrainingProblem};
@@ -40,14 +38,12 @@ use densify_train::output::{
 use densify_train::trainer::{StepReport, TrainError};
 use densify_train::vignette::named_vignettes;
 use geometry::measure;
-use records::{Logs, Spent, Totals};
+use records::{Logs, Unwritten};
 
 /// The file beside a model with the exposures of the training views.
 const EXPOSURES: &str = "exposure.json";
 /// The file beside a model with the vignettes of the cameras.
 const VIGNETTES: &str = "vignette.json";
-/// Steps between two records of the log.
-const RECORD_EVERY: u32 = 10;
 
 /// A run in progress.
 struct Session<'a> {
@@ -58,7 +54,6 @@ struct Session<'a> {
     /// The folder that files are written to.
     folder: PathBuf,
     logs: Logs,
-    totals: Totals,
     /// Detects that another run has taken over the folder.
     guard: Guard,
     /// True if the user has been told about the coordinates of saved models.
@@ -79,10 +74,10 @@ pub enum Occupied {
 /// Trains to the end and writes all files of the run; returns the folder.
 fn train(run: Run, if_exists: Occupied, observer: &dyn Observer) -> Result<PathBuf, Failure> {
     // Nothing is removed from a run that is being resumed, even if it consists only of its configuration file.
-    let has_begun = run.session.is_some() || run.output.join(CONFIG_FILE).exists();
+    let has_begun = run.logs.is_some() || run.output.join(CONFIG_FILE).exists();
     let resumes = if_exists == Occupied::Resume && has_begun;
     let folder = match if_exists {
-        Occupied::Resume => RunFolder::resume(&run.output, run.session.is_none())?,
+        Occupied::Resume => RunFolder::resume(&run.output, run.logs.is_none())?,
         Occupied::Refuse | Occupied::Replace => {
             RunFolder::create(&run.output, if_exists == Occupied::Replace)?
         }
@@ -163,14 +158,14 @@ impl<'a> Session<'a> {
     ) -> Result<Self, Failure> {
         let (guard, folder) = (folder.guard(), folder.path());
         let folder = folder.as_path();
-        let saved = run.session.take();
-        let Opened { config, logs, totals, lost } = open(&run, folder, saved)?;
+        let Opened { config, logs, lost } = open(&mut run, folder)?;
+        run.unwritten = Unwritten::default();
         for name in lost {
             observer.say(format_args!("note: {name} has lost records; they stay missing"));
         }
         let folder = folder.to_owned();
         let has_told_coordinates = false;
-        Ok(Self { run, config, observer, folder, logs, totals, guard, has_told_coordinates })
+        Ok(Self { run, config, observer, folder, logs, guard, has_told_coordinates })
     }
 
     /// Does all remaining steps.
@@ -223,7 +218,7 @@ impl<'a> Session<'a> {
 
     /// Fails if more than half of the last renderings are empty, because such a model is useless.
     fn check_drawn(&self) -> Result<(), Failure> {
-        let drawn = &self.totals.drawn;
+        let drawn = &self.run.totals.drawn;
         let (views, empty) = (drawn.len(), drawn.iter().filter(|drawn| !**drawn).count());
         if 2 * empty <= views {
             return Ok(());
@@ -246,7 +241,7 @@ impl<'a> Session<'a> {
         if saves && !exists(model_path(&self.folder, step)) {
             self.save(step)?;
         }
-        if tests && !(is_resumed && self.totals.tested.contains_key(&step)) {
+        if tests && !(is_resumed && self.run.totals.tested.contains_key(&step)) {
             self.test(step, is_last)?;
         }
         if due && !exists(checkpoint_path(&self.folder, step)) {
@@ -262,7 +257,7 @@ impl<'a> Session<'a> {
             return Ok(());
         }
         self.guard.check()?;
-        let session = self.logs.save(&self.totals, self.run.process)?;
+        let session = self.logs.save(&self.run.totals, self.run.process)?;
         write_state(&mut self.run, &self.folder, self.config.clone(), session)?;
         Ok(())
     }
@@ -287,16 +282,10 @@ impl<'a> Session<'a> {
     /// Does one step and records it. If the policy fails, the model is saved; if values are not finite, or a photograph
     /// can no longer be read, a checkpoint is written.
     fn step(&mut self) -> Result<StepReport, Failure> {
-        let (wall, cpu) = (Instant::now(), ProcessTime::try_now().ok());
         let train_views = self.run.dataset.train.len();
-        let stepped = self.run.trainer.step();
-        self.totals.add(Spent::since(wall, cpu));
-        for &(stage, time) in self.run.trainer.backend().stage_times() {
-            self.totals.stage(stage, time);
-        }
-        match stepped {
+        match self.run.step() {
             Ok(report) => {
-                self.record(&report)?;
+                self.record()?;
                 Ok(report)
             }
             Err(error @ TrainError::Policy { .. }) => {
@@ -316,26 +305,12 @@ impl<'a> Session<'a> {
         }
     }
 
-    fn record(&mut self, report: &StepReport) -> Result<(), FileError> {
-        let Self { logs, totals, run, observer, .. } = self;
-        for event in &report.events {
-            observer.edited(event);
-            logs.events.append(event)?;
+    fn record(&mut self) -> Result<(), FileError> {
+        let unwritten = std::mem::take(&mut self.run.unwritten);
+        if !unwritten.records.is_empty() {
+            say_notes(self.observer, &self.run.dataset.take_depth_faults());
         }
-        totals.step(&report.output, run.dataset.train.len());
-        let step = report.step;
-        // The original end of an extended run has a record, too, so that records do not depend on the extension.
-        let ends = [run.spec.schedule.iterations.0, run.last].contains(&step);
-        if step.is_multiple_of(RECORD_EVERY) || ends {
-            say_notes(*observer, &run.dataset.take_depth_faults());
-            let record = totals.record(step, report.rows, (run.process.resident)());
-            observer.recorded(&record);
-            logs.steps.append(&record)?;
-            let depth = record.depth.map(|depth| ("depth", depth));
-            let scalars = [("loss", record.loss), ("rows", report.rows as f32)].into_iter();
-            logs.board.scalars(step, &scalars.chain(depth).collect::<Vec<_>>())?;
-        }
-        Ok(())
+        self.logs.write(&unwritten, self.observer)
     }
 
     /// Writes the model and returns its file.
@@ -401,7 +376,7 @@ impl<'a> Session<'a> {
         if let Some(fitted) = mean.fitted {
             self.logs.board.scalars(step, &[("test/psnr fitted", fitted.psnr as f32)])?;
         }
-        self.totals.tested.insert(step, mean);
+        self.run.totals.tested.insert(step, mean);
         self.observer.tested(step, &mean);
         if !is_last {
             self.observer.say(format_args!(

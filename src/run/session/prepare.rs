@@ -5,6 +5,7 @@ use std::path::Path;
 
 use super::degree_trial;
 use super::first_model::{append_to_frozen, check_coordinates, first_model};
+use super::records::{SavedSession, Totals, Unwritten};
 use super::resume::{self, Resumed};
 use super::run::Run;
 use crate::failure::{Failure, OptionProblem};
@@ -94,6 +95,10 @@ pub(super) fn prepare(
         trainer.record_history()?;
     }
     let checkpoint = session.as_ref().map(|_| trainer.steps_done());
+    let (totals, logs) = match session {
+        Some(SavedSession { totals, logs }) => (totals, Some(logs)),
+        None => (Totals::after(spent), None),
+    };
     let newest_checkpoint = checkpoint.and_then(|_| newest_step(&output));
     Ok(Run {
         spec: spec.clone(),
@@ -106,10 +111,11 @@ pub(super) fn prepare(
         geometry_measurement,
         fingerprint,
         last,
-        session,
+        totals,
+        unwritten: Unwritten::default(),
+        logs,
         checkpoint,
         newest_checkpoint,
-        spent,
         process,
     })
 }

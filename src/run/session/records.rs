@@ -8,13 +8,15 @@ use std::time::{Duration, Instant};
 use cpu_time::ProcessTime;
 use serde::{Deserialize, Serialize};
 
+use crate::observer::Observer;
 use crate::process::ProcessMemory;
 use densify_core::files::FileError;
 use densify_render::StepOutput;
 use densify_train::output::{Mean, RecordLog, StepRecord, TensorBoard};
+use densify_train::trainer::EditEvent;
 
 /// Sums and scores of the run so far.
-#[derive(Debug, Clone, Default, Serialize, Deserialize)]
+#[derive(Debug, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Totals {
     window: Window,
@@ -53,7 +55,7 @@ impl Spent {
 }
 
 /// Sums over the steps since the last record.
-#[derive(Debug, Clone, Default, Serialize, Deserialize)]
+#[derive(Debug, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Window {
     steps: u32,
@@ -140,21 +142,28 @@ pub(super) struct Logs {
     pub(super) board: TensorBoard,
 }
 
+/// Edits and records that are not in the logs yet.
+#[derive(Debug, Default)]
+pub(super) struct Unwritten {
+    pub(super) events: Vec<EditEvent>,
+    pub(super) records: Vec<StepRecord>,
+}
+
 /// Lengths of the logs at a checkpoint `[bytes]`.
-#[derive(Debug, Clone, Serialize, Deserialize)]
+#[derive(Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-struct Lengths {
+pub(super) struct Lengths {
     steps: u64,
     events: u64,
     board: (String, u64),
 }
 
 /// The state of the session in a checkpoint.
-#[derive(Debug, Clone, Serialize, Deserialize)]
+#[derive(Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct SavedSession {
-    totals: Totals,
-    logs: Lengths,
+    pub(super) totals: Totals,
+    pub(super) logs: Lengths,
 }
 
 const STEPS: &str = "stats/train.jsonl";
@@ -167,6 +176,26 @@ impl Logs {
             events: RecordLog::create(&folder.join(EVENTS))?,
             board: TensorBoard::create(folder)?,
         })
+    }
+
+    /// Adds edits and records to the logs, and hands them to the observer.
+    pub(super) fn write(
+        &mut self,
+        unwritten: &Unwritten,
+        observer: &dyn Observer,
+    ) -> Result<(), FileError> {
+        for event in &unwritten.events {
+            observer.edited(event);
+            self.events.append(event)?;
+        }
+        for record in &unwritten.records {
+            observer.recorded(record);
+            self.steps.append(record)?;
+            let depth = record.depth.map(|depth| ("depth", depth));
+            let scalars = [("loss", record.loss), ("rows", record.rows as f32)].into_iter();
+            self.board.scalars(record.step, &scalars.chain(depth).collect::<Vec<_>>())?;
+        }
+        Ok(())
     }
 
     /// Syncs all records to disk, and returns the state of the session as JSON.
@@ -189,14 +218,13 @@ impl Logs {
     /// Reopens the logs at their saved lengths, and returns the names of logs that have lost records since.
     pub(super) fn resume(
         folder: &Path,
-        saved: SavedSession,
-    ) -> Result<(Self, Totals, Vec<&'static str>), FileError> {
-        let SavedSession { totals, logs } = saved;
+        logs: &Lengths,
+    ) -> Result<(Self, Vec<&'static str>), FileError> {
         let (steps, steps_whole) = RecordLog::resume(&folder.join(STEPS), logs.steps)?;
         let (events, events_whole) = RecordLog::resume(&folder.join(EVENTS), logs.events)?;
         let board = TensorBoard::resume(folder, &logs.board.0, logs.board.1)?;
         let lost = [(STEPS, steps_whole), (EVENTS, events_whole)];
         let lost = lost.into_iter().filter(|(_, whole)| !whole).map(|(name, _)| name).collect();
-        Ok((Self { steps, events, board }, totals, lost))
+        Ok((Self { steps, events, board }, lost))
     }
 }

@@ -1,8 +1,11 @@
 //! A prepared run.
 
 use std::path::PathBuf;
+use std::time::Instant;
 
-use super::records::{SavedSession, Spent};
+use cpu_time::ProcessTime;
+
+use super::records::{Lengths, Spent, Totals, Unwritten};
 use super::resume::Resumed;
 use super::{Occupied, prepare, train};
 use crate::failure::Failure;
@@ -17,7 +20,10 @@ use densify_data::dataset::Dataset;
 use densify_data::models::Coordinates;
 use densify_data::views::DatasetViews;
 use densify_train::checkpoint::Fingerprint;
-use densify_train::trainer::Trainer;
+use densify_train::trainer::{StepReport, TrainError, Trainer};
+
+/// Steps between two records of the log.
+const RECORD_EVERY: u32 = 10;
 
 /// A run, ready to train.
 pub struct Run {
@@ -40,14 +46,16 @@ pub struct Run {
     pub(super) fingerprint: Fingerprint,
     /// The step at which the run ends.
     pub last: u32,
-    /// State of the logs, for a run that was resumed or has saved a checkpoint.
-    pub(super) session: Option<SavedSession>,
+    /// Sums and scores so far.
+    pub(super) totals: Totals,
+    /// Edits and records of steps that were done before the logs were opened.
+    pub(super) unwritten: Unwritten,
+    /// Lengths of the logs in the run's folder, for a run that was resumed or has saved a checkpoint.
+    pub(super) logs: Option<Lengths>,
     /// Step of the last checkpoint that this run has written or resumed from.
     pub(super) checkpoint: Option<u32>,
     /// Step of the newest checkpoint in the run's folder, as this run has left or found it.
     pub(super) newest_checkpoint: Option<u32>,
-    /// Time spent before the first step on trial runs, if there were any.
-    pub(super) spent: Option<Spent>,
     pub(super) process: ProcessMemory,
 }
 
@@ -70,6 +78,29 @@ impl Run {
         host: Host<'_>,
     ) -> Result<Self, Failure> {
         prepare::prepare(spec, resumed, host)
+    }
+
+    /// Does one step. Its edits and its record are written with the next checkpoint, or when [`train`](Self::train) begins.
+    ///
+    /// # Errors
+    /// As [`Trainer::step`].
+    pub fn step(&mut self) -> Result<StepReport, TrainError> {
+        let (wall, cpu) = (Instant::now(), ProcessTime::try_now().ok());
+        let stepped = self.trainer.step();
+        self.totals.add(Spent::since(wall, cpu));
+        for &(stage, time) in self.trainer.backend().stage_times() {
+            self.totals.stage(stage, time);
+        }
+        let report = stepped?;
+        self.totals.step(&report.output, self.dataset.train.len());
+        self.unwritten.events.extend_from_slice(&report.events);
+        // The original end of an extended run has a record, too, so that records do not depend on the extension.
+        let ends = [self.spec.schedule.iterations.0, self.last];
+        if report.step.is_multiple_of(RECORD_EVERY) || ends.contains(&report.step) {
+            let resident = (self.process.resident)();
+            self.unwritten.records.push(self.totals.record(report.step, report.rows, resident));
+        }
+        Ok(report)
     }
 
     /// Trains to the end, writes nothing, and returns the model in the dataset's own coordinates. In a scene far from

@@ -21,7 +21,7 @@ impl Session<'_> {
             ("images", trainer.images_time()),
         ];
         let more = more.map(|(stage, time)| (stage.to_owned(), time));
-        let stages = self.totals.stages.clone().into_iter().chain(more);
+        let stages = self.run.totals.stages.clone().into_iter().chain(more);
         let stage_seconds = stages.map(|(stage, time)| (stage, time.as_secs_f64())).collect();
         let summary = Summary {
             densify: config.densify.clone(),
@@ -32,16 +32,16 @@ impl Session<'_> {
             peak_rows: state.peak_rows,
             budget: config.budget,
             extra_forwards: state.extra_forwards,
-            peak_bytes: self.totals.peak_bytes(self.run.process),
+            peak_bytes: self.run.totals.peak_bytes(self.run.process),
             memory: spec.size.memory.map(|bytes| bytes.0),
             ledger_bytes: ledger.total(),
             ledger: ledger.clone(),
-            seconds: self.totals.wall.as_secs_f64(),
+            seconds: self.run.totals.wall.as_secs_f64(),
             stage_seconds,
-            cpu_seconds: self.totals.cpu.map(|cpu| cpu.as_secs_f64()),
+            cpu_seconds: self.run.totals.cpu.map(|cpu| cpu.as_secs_f64()),
             train_views: trainer.views().count(),
             test_views: test.count(),
-            test: self.totals.tested.clone(),
+            test: self.run.totals.tested.clone(),
         };
         write_json(&self.folder.join(REQUIREMENTS), &self.requirements())?;
         write_json(&self.folder.join("stats/summary.json"), &summary)
@@ -59,7 +59,7 @@ impl Session<'_> {
     pub(super) fn report(&self, path: &Path) {
         let Run { config, trainer, test, ledger, .. } = &self.run;
         let steps = trainer.steps_done();
-        if let Some(Mean { psnr, ssim, flip, fitted, .. }) = self.totals.tested.get(&steps) {
+        if let Some(Mean { psnr, ssim, flip, fitted, .. }) = self.run.totals.tested.get(&steps) {
             let views = test.count();
             self.observer.say(format_args!(
                 "test     PSNR {psnr:.2} dB, SSIM {ssim:.4}, FLIP {flip:.4} (mean of {views} views)"
@@ -92,14 +92,14 @@ impl Session<'_> {
             grouped(config.budget)
         ));
         let promised = Bytes(ledger.total());
-        if let Some(peak) = self.totals.peak_bytes(self.run.process) {
+        if let Some(peak) = self.run.totals.peak_bytes(self.run.process) {
             let peak = Bytes(peak);
             self.observer.say(format_args!("memory   {peak} at its peak, {promised} promised"));
         }
-        let cpu = self.totals.cpu_of_steps().map_or_else(String::new, |cpu| {
+        let cpu = self.run.totals.cpu_of_steps().map_or_else(String::new, |cpu| {
             format!(", {:.4} CPU-seconds per iteration", cpu.as_secs_f64() / f64::from(steps))
         });
-        self.observer.say(format_args!("time     {}{cpu}", duration(self.totals.wall)));
+        self.observer.say(format_args!("time     {}{cpu}", duration(self.run.totals.wall)));
         for line in self.requirements().lines(self.observer.spelling()) {
             self.observer.say(format_args!("{line}"));
         }

@@ -142,7 +142,7 @@ fn contradictory_flags_are_both_named() {
 #[ignore = "takes minutes: run by .ci/run"]
 fn a_degree_decided_by_trial_runs_survives_resuming() {
     let (root, whole) = scratch();
-    let flags = "-r 2 --memory 64MiB --sh-degree auto --iterations 5000 --backend cpu";
+    let flags = "-r 2 --memory 52MiB --sh-degree auto --iterations 5000 --backend cpu";
     let outcome =
         call(&format!("train scene:spheres -o {} {flags} --checkpoint-every 2500", text(&whole)));
     let outcome = outcome.ok();
@@ -162,13 +162,13 @@ fn a_degree_decided_by_trial_runs_survives_resuming() {
     assert_eq!(report(&part), found);
 }
 
-/// In the room of layers, more Gaussians are worth more than view-dependent colours.
+/// In the room, more Gaussians are worth more than view-dependent colours.
 #[test]
 #[ignore = "takes minutes: run by .ci/run"]
 fn trial_runs_choose_more_gaussians_where_they_pay() {
     let (_root, run) = scratch();
-    let flags = "-r 2 --memory 84MiB --sh-degree auto --iterations 5000 --backend cpu";
-    let outcome = call(&format!("train scene:layers -o {} {flags}", text(&run))).ok();
+    let flags = "-r 2 --memory 76MiB --sh-degree auto --iterations 5000 --backend cpu";
+    let outcome = call(&format!("train scene:room -o {} {flags}", text(&run))).ok();
     assert!(
         outcome.stdout.contains("colour   degree 0 (auto): in trial runs"),
         "{}",
