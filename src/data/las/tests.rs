@@ -1,4 +1,4 @@
-//! Tests of the reader of LAS and LAZ files. The crate writes the LAZ files.
+//! Tests of the reader of LAS and LAZ files. The crate writes the LAZ files, LASzip and lazperf those of the corpus.
 
 use std::io::Cursor;
 
@@ -181,6 +181,21 @@ fn the_place_of_the_table_may_be_at_the_end() {
     assert!(read_bytes(&file).unwrap_err().contains("the table of chunks: its place is"));
     file.extend(place);
     assert_eq!(read_bytes(&file).unwrap(), read_bytes(&las(3, &records)).unwrap());
+}
+
+#[test]
+fn files_of_other_programs_are_read() {
+    let read_file = |name: &str| read(&densify_fixtures::corpus("las").join(name)).unwrap();
+    for (file, packed) in [
+        ("format3.las", "format3_laszip.laz"),
+        ("format7.las", "format7_laszip.laz"),
+        ("format7.las", "format7_lazperf.laz"),
+    ] {
+        let points = read_file(file);
+        assert_eq!(points.len(), 12);
+        assert!(points.colours[0] != points.colours[1]);
+        assert_eq!(read_file(packed), points, "{packed}");
+    }
 }
 
 #[test]
