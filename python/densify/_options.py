@@ -76,7 +76,7 @@ class Options(TypedDict, total=False):
     """What the values measure (default: axis)"""
 
     depth_points: StrPath
-    """Point cloud in the dataset's coordinates (PLY or LAS), such as a laser scan, to be projected into the views instead of reading depth maps, as with --depth on. If the dataset has no points, training starts from these"""
+    """Point cloud in the dataset's coordinates (PLY, LAS or LAZ), such as a laser scan, to be projected into the views instead of reading depth maps, as with --depth on. If the dataset has no points, training starts from these"""
 
     depth_weight: float | str
     """Weight of the depth term, at the first and at the last iteration; one number: the same throughout (default: 0.05:0.001)"""

@@ -2,11 +2,11 @@
 //! This layer depends on neither backends nor runs.
 //!
 //! Its modules in order, each using only those before it: `error`, `picture_file`, `ply`, [`meshes`], [`models`], [`points`],
-//! `las`, [`dataset`], [`track_colours`], [`track_poses`] and [`views`].
+//! [`las`], [`dataset`], [`track_colours`], [`track_poses`] and [`views`].
 
 pub mod dataset;
 mod error;
-mod las;
+pub mod las;
 pub mod meshes;
 pub mod models;
 mod picture_file;

@@ -7,6 +7,7 @@
 use std::path::Path;
 
 use densify::data::dataset::{Dataset, LoadOptions, TrackReading, formats as dataset_formats};
+use densify::data::las;
 use densify::data::meshes;
 use densify::data::models::{formats as model_formats, read_model};
 use densify::data::points::read_points;
@@ -47,11 +48,12 @@ pub fn targets() -> Vec<Target> {
         photographs: &["images/0.png", "images/1.png"],
         accepts: |folder, _| accepts_dataset(folder),
     });
-    let others: [Other; 9] = [
+    let others: [Other; 10] = [
         ("archive", "scan.zip", |_, file| accepts_dataset(file)),
         ("checkpoint", "step.safetensors", |_, file| accepts_checkpoint(file)),
         ("config", "config.toml", |folder, _| accepts_config(folder)),
         ("image", "images/0.png", |folder, _| accepts_images(folder)),
+        ("las", "scan.las", |_, file| accepts_scan(file)),
         ("mesh-glb", "mesh.glb", |_, file| accepts_mesh(file)),
         ("mesh-gltf", "mesh.gltf", |_, file| accepts_mesh(file)),
         ("mesh-obj", "mesh.obj", |_, file| accepts_mesh(file)),
@@ -112,6 +114,13 @@ fn accepts_model(folder: &Path, file: &Path) -> bool {
 
 fn accepts_points(path: &Path) -> bool {
     read_points(path).is_ok_and(|(points, _)| {
+        assert_eq!(points.colours.len(), points.positions.len());
+        true
+    })
+}
+
+fn accepts_scan(path: &Path) -> bool {
+    las::read(path).is_ok_and(|points| {
         assert_eq!(points.colours.len(), points.positions.len());
         true
     })

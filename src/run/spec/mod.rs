@@ -228,8 +228,9 @@ run_spec! {
         /// What the values measure (default: axis)
         depth_along: Option<DepthAlong> = None, Fixed, value "WHICH";
 
-        /// Point cloud in the dataset's coordinates (PLY or LAS), such as a laser scan, to be projected into the views
-        /// instead of reading depth maps, as with --depth on. If the dataset has no points, training starts from these
+        /// Point cloud in the dataset's coordinates (PLY, LAS or LAZ), such as a laser scan, to be projected into the
+        /// views instead of reading depth maps, as with --depth on. If the dataset has no points, training starts from
+        /// these
         depth_points: Option<AbsolutePath> = None, Fixed, value "FILE";
 
         /// Weight of the depth term, at the first and at the last iteration; one number: the same throughout (default:

@@ -72,7 +72,7 @@ impl PointSet {
     }
 }
 
-/// Reads the points of a PLY or LAS file, which is recognised by its first bytes.
+/// Reads the points of a PLY, LAS or LAZ file, which is recognised by its first bytes.
 pub(in super::super) fn read(path: &Path) -> Result<PointCloud, LoadError> {
     let mut start = Vec::new();
     let file = files::open(path).map_err(LoadError::io(path))?;
