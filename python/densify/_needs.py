@@ -151,17 +151,17 @@ def signals() -> list[SignalInfo]:
     """All signals that a policy can declare, with their meaning."""
     found = []
     for name, unit, width, is_resettable, meaning in _densify.signals():
-        # Links to Rust items become their names, in the spelling of Python.
-        plain = re.sub(r"\[`([^`]+)`\]\([^)]*\)|\[`([^`]+)`\]", lambda link: _spelled(link[1] or link[2]), meaning)
-        found.append(SignalInfo(name, unit, width, is_resettable, " ".join(plain.split())))
+        plain = re.sub(r"\[`?([^\]`]+)`?\]\(([^)]*)\)|\[`([A-Z_a-z:]+)`\]", _linked, meaning)
+        found.append(SignalInfo(name, unit, width, is_resettable, " ".join(plain.replace("`", "").split())))
     return found
 
 
-def _spelled(item: str) -> str:
-    """``WeightSum`` as weight_sum; ``Needs::full_depth`` as Needs.full_depth."""
-    if "::" in item:
-        return item.replace("::", ".")
-    return re.sub(r"(?<=[a-z])([A-Z])", r"_\1", item).lower()
+def _linked(link: re.Match[str]) -> str:
+    """The text of a link of Rust's documentation; signals have their Python names."""
+    text, target, alone = link.groups()
+    if target is not None and target.startswith("Self::"):
+        return re.sub(r"(?<=[a-z])([A-Z])", r"_\1", text).lower()
+    return (text or alone).replace("::", ".")
 
 
 @dataclass(frozen=True)

@@ -142,7 +142,7 @@ fn contradictory_flags_are_both_named() {
 #[ignore = "takes minutes: run by .ci/run"]
 fn a_degree_decided_by_trial_runs_survives_resuming() {
     let (root, whole) = scratch();
-    let flags = "-r 2 --memory 52MiB --sh-degree auto --iterations 5000 --backend cpu";
+    let flags = "-r 2 --memory 60MiB --sh-degree auto --iterations 5000 --backend cpu";
     let outcome =
         call(&format!("train scene:spheres -o {} {flags} --checkpoint-every 2500", text(&whole)));
     let outcome = outcome.ok();
@@ -167,7 +167,7 @@ fn a_degree_decided_by_trial_runs_survives_resuming() {
 #[ignore = "takes minutes: run by .ci/run"]
 fn trial_runs_choose_more_gaussians_where_they_pay() {
     let (_root, run) = scratch();
-    let flags = "-r 2 --memory 76MiB --sh-degree auto --iterations 5000 --backend cpu";
+    let flags = "-r 2 --memory 84MiB --sh-degree auto --iterations 5000 --backend cpu";
     let outcome = call(&format!("train scene:room -o {} {flags}", text(&run))).ok();
     assert!(
         outcome.stdout.contains("colour   degree 0 (auto): in trial runs"),
