@@ -77,7 +77,7 @@ mod tests {
         for (text, word) in [
             ("nonsense", "spheres, thin"),
             ("nonsense:3", "spheres, thin"),
-            ("room:3", "write room"),
+            ("room:3", "use room"),
             ("town:", "town:1 to town:16"),
             ("town:0", "town:1 to town:16"),
             ("town:17", "town:1 to town:16"),

@@ -185,7 +185,7 @@ fn invalid_input_is_refused_and_writes_nothing() {
         ("nothing.obj", &["nothing.obj"]),
         ("mesh.fbx", &["mesh.fbx", ".obj"]),
         ("--preset nonsense", &["nonsense", "spheres"]),
-        ("--preset room:2", &["room:2", "write room"]),
+        ("--preset room:2", &["room:2", "use room"]),
         ("--preset town:17", &["town:17", "town:1 to town:16"]),
         ("--preset thin --size 99999", &["--size", "99999"]),
         ("--preset thin --fov 180", &["--fov"]),

@@ -170,7 +170,7 @@ mod tests {
         }
         let text = format(&all, &policies);
         let expected = "\
-rank  policy  PSNR [dB]  from a                  SSIM  rank    FLIP  rank  runs
+rank  policy  PSNR [dB]  vs a                    SSIM  rank    FLIP  rank  runs
    1  b          31.000  +1.00 [+1.00, +1.00]  0.3100     1  0.6900     1     3
    1  d          31.000  +1.00 [+1.00, +1.00]  0.3100     1  0.6900     1     3
    3  a          30.000                        0.3000     3  0.7000     3     3
@@ -190,7 +190,7 @@ rank  policy  PSNR [dB]  from a                  SSIM  rank    FLIP  rank  runs
         assert_eq!(ranks, [Some(2), Some(1)]);
         let text = format(&all, &policies);
         assert!(text.contains("1  b          31.000  +1.00, one run"), "{text}");
-        assert!(text.contains("1  (1 more over the budget, not counted)"), "{text}");
+        assert!(text.contains("1  (and 1 over the budget, not counted)"), "{text}");
     }
 
     #[test]
