@@ -12,9 +12,10 @@ import math
 import platform
 import sys
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import entry_points
+from os import PathLike, fspath
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast
 
@@ -64,6 +65,12 @@ class _Registered:
 
 #: Policies by name that other processes do not find by themselves, unlike those of installed packages.
 _of_this_program: dict[str, _Registered] = {}
+
+
+def files_of(options: Mapping[str, Any]) -> list[str]:
+    """The option ``policy_file``: files or modules, or a single one."""
+    given = options.get("policy_file") or ()
+    return [fspath(file) for file in ([given] if isinstance(given, (str, PathLike)) else given)]
 
 
 def interval(default: int) -> int:

@@ -26,6 +26,7 @@ def table_of(scene: Scene | None, policy: PolicyLike | None, output: StrPath | N
     if output is not None:
         table["output"] = fspath(output)
     _policy.load_installed()
+    files = _policy.files_of(table)
     if policy is not None:
         name, settings, file = _policy.name_and_settings(policy)
         table["policy"] = name
@@ -33,7 +34,8 @@ def table_of(scene: Scene | None, policy: PolicyLike | None, output: StrPath | N
             given = dict(table.get("policy_set") or {})
             given[name] = {**settings, **given.get(name, {})}
             table["policy_set"] = given
-        if file is not None:
-            files = [str(known) for known in table.get("policy_file") or ()]
-            table["policy_file"] = files if file in files else [*files, file]
+        if file is not None and file not in files:
+            files.append(file)
+    if files:
+        table["policy_file"] = files
     return plain(table)

@@ -137,7 +137,7 @@ def compare(
     """
     _policy.check_not_importing()
     table: dict[str, Any] = dict(options)
-    files = [str(known) for known in table.get("policy_file") or ()]
+    files = _policy.files_of(table)
     names = []
     for policy in policies:
         name, settings, file = _policy.name_and_settings(policy)

@@ -332,6 +332,13 @@ def test_schedules_and_views(scene: Path, tmp_path: Path) -> None:
             train(scene, policy, tmp_path / name)
 
 
+def test_a_single_policy_file_needs_no_list(scene: Path, tmp_path: Path) -> None:
+    file = EXAMPLES / "steady.py"
+    for name, given in (("text", str(file)), ("path", file), ("list", [str(file)])):
+        run = train(scene, "steady", tmp_path / name, policy_file=given)
+        assert run.config["policy_file"] == [str(file.resolve())]
+
+
 def test_a_run_is_the_same_in_another_process(scene: Path, tmp_path: Path) -> None:
     """The command knows the policies of a file, trains with them, and resumes their runs."""
     words = [sys.executable, "-m", "densify"]
