@@ -183,11 +183,16 @@ impl<'a> Case<'a> {
             vignette: CameraVignettes::known(has_vignettes, super::VignetteSource::Given),
             poses: RefinedPoses::known(refines_poses, super::PoseSource::Given),
         })?;
-        if case.inputs.device.adapter().is_none() {
-            // The run will be another process, so what this one holds counts only if it includes a driver's kernels.
-            case.inputs.to_mut().resident = None;
-        }
+        case.leave_out_this_process();
         Ok(case)
+    }
+
+    /// For a run that will be another process: what this one holds counts only if it includes a driver's kernels.
+    pub(super) fn leave_out_this_process(&mut self) {
+        if self.inputs.device.adapter().is_none() {
+            let inputs = self.inputs.to_mut();
+            (inputs.resident, inputs.peak) = (None, None);
+        }
     }
 
     fn open(

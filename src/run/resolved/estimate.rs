@@ -1,5 +1,7 @@
 //! The memory and the extent of runs that are only planned here and trained later, such as those of a batch.
 
+use super::case::Case;
+use super::size::Size;
 use super::{ModelSize, ResolvedRun};
 use crate::failure::Failure;
 use crate::host::Host;
@@ -37,12 +39,14 @@ pub struct Extent {
     pub is_on_gpu: bool,
 }
 
-/// The extent of a run.
+/// The extent of a run in another process.
 ///
 /// # Errors
 /// The errors of preparing the run.
 pub fn extent(spec: &RunSpec, host: Host<'_>) -> Result<Extent, Failure> {
-    let ResolvedRun { case, size, .. } = ResolvedRun::for_new_run(spec, host)?;
+    let mut case = Case::for_new_run(spec, host)?;
+    case.leave_out_this_process();
+    let size = Size::choose(&case)?.run_size;
     let dataset = &case.inputs.dataset;
     let areas = dataset.train.iter().map(|view| {
         let camera = &view.camera;
