@@ -45,10 +45,12 @@ class Listener:
     def step(self, step: int, loss: float, rows: int) -> None:
         if self._on_step is not None:
             self._on_step(step, loss, rows)
+        if not self._progress:
+            return
         now = time.monotonic()
         speed = (step - self._done) / max(now - self._start, 1e-9)
         self._text = f"step {step}/{self._last}  {speed:.1f} it/s  loss {loss:.4f}  {rows:,} Gaussians"
-        if self._progress and now - self._drawn >= 0.1:
+        if now - self._drawn >= 0.1:
             self._drawn = now
             self._draw()
 
@@ -67,7 +69,7 @@ class Listener:
 
     def end(self) -> None:
         # The last step may have been too soon after another one.
-        if self._progress and self._text:
+        if self._text:
             self._draw()
         self._clear()
 

@@ -44,8 +44,8 @@
 //!   but the score has another scale: nearly every Gaussian that is seen is a candidate. In the published run of bonsai
 //!   most are candidates, too: it grows from 206,613 to 1,830,000 Gaussians in 7,000 steps, and these rules would give
 //!   2,080,000 if all were.
-//! - Here each pixel's error is weighted by its edge strength; the published code has a separate score of edges per Gaussian, which also
-//!   weights the draw of replacements, and a second factor for ridges.
+//! - Here each pixel's error is weighted by its edge strength; the published code has a separate score of edges per
+//!   Gaussian, which also weights the draw of replacements, and a second factor for ridges.
 //! - The share of the screen that a Gaussian covers is not limited. The published code shrinks those that cover more
 //!   than 0.587 and splits them first.
 //! - No share of the growth is reserved for far Gaussians and far points.
